@@ -1,0 +1,36 @@
+# mi_neural: `make` lists the targets.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/mi_neural.stamp
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+# The environment, made once and again whenever pyproject.toml changes.
+$(STAMP): pyproject.toml
+	@command -v $(PYTHON) > /dev/null || { \
+	    echo "mi_neural: no '$(PYTHON)' found. Install Python 3.10 or newer, or type: make PYTHON=/path/to/python3"; exit 1; }
+	@$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 10) or sys.exit("mi_neural: this is Python %d.%d; \
+	it needs 3.10 or newer. Type: make PYTHON=python3.11" % v[:2])'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+	    echo "mi_neural: could not make $(VENV). On Debian and Ubuntu type: apt install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet -e '.[denoise,test]'
+	@touch $@
+
+demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EXR and PNG in out/demo
+	$(BIN)/mi-neural compare ajar_door -i path -i nirc --seconds 5,20 --denoise -o out/demo
+
+test: $(STAMP)  ## the default tests, a few minutes on two cores
+	$(BIN)/python -m pytest
+
+lint: $(STAMP)  ## ruff
+	$(BIN)/ruff check .
+
+clean:  ## remove what builds, tests and the demo wrote (keeps .venv)
+	rm -rf out build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""What is learned: fields, their encodings and losses, and the caches made of them."""

@@ -1,0 +1,1 @@
+"""What is known about the result: error metrics, EXR files, benchmarks, reports."""

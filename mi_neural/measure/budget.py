@@ -1,0 +1,304 @@
+"""Rendering to a number of samples or within a time, in passes, with honest clocks.
+
+Dr.Jit works asynchronously: the clock is read after ``dr.sync_thread()`` only. Kernels are compiled before it starts
+(:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; what an integrator
+with a cache can do beyond Mitsuba's own is looked up by name: `train`, `train_seconds`, `train_fraction`, `prepare`,
+`statistics`, `reset`.
+
+Ctrl-C ends a rendering early and keeps what has been rendered; the result says so. During training it ends the
+training, and one pass is rendered with what has been learned.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .load import split_channels
+
+#: Called with (done, total), in samples, frames or seconds.
+Progress = Callable[[float, float], None]
+
+#: Samples a pixel that one pass under a time budget may have. Few and fixed, so that each can be compiled beforehand.
+PASS_SPP = (1, 4, 16, 64)
+#: Longest planned pass in seconds: what a Ctrl-C may have to wait for. Longer passes pay Mitsuba's cost per call less
+#: often.
+PASS_SECONDS = 1.0
+#: Most samples in one pass. 2^21 paths need less than 1 GiB in every scene measured.
+PASS_SAMPLES = 2**21
+
+# Streams of random numbers that share nothing: warm-up, image, guides of the denoiser, reference
+STREAM_WARM_UP, STREAM_IMAGE, STREAM_GUIDES, STREAM_REFERENCE = range(4)
+
+
+@dataclass
+class Rendered:
+    """One image and what it cost.
+
+    rgb              float32, shape (height, width, 3), linear, the sample-weighted mean of all passes
+    channels         what else the integrator shows, by name, each of shape (height, width)
+    spp              samples a pixel actually taken
+    nonfinite        pixels of single passes that were left out because they held a NaN or an infinity
+    seconds_train    wall time in training, also in such as happens inside of the first render call
+    seconds_render   wall time in rendering without it
+    statistics       what the integrator says about itself, {} for Mitsuba's own
+    interrupted      Ctrl-C ended it early
+    """
+
+    rgb: np.ndarray
+    channels: dict[str, np.ndarray]
+    spp: int
+    nonfinite: int
+    seconds_train: float
+    seconds_render: float
+    statistics: dict[str, float] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+class Accumulator:
+    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted."""
+
+    def __init__(self) -> None:
+        self.total: np.ndarray | None = None
+        self.weight: np.ndarray | None = None
+        self.spp = 0
+        self.nonfinite = 0
+
+    def add(self, image: np.ndarray, spp: int) -> None:
+        """Add a developed film of shape (height, width, channels) that was rendered with `spp` samples a pixel."""
+        image = np.asarray(image, np.float64)
+        if self.total is None:
+            self.total = np.zeros_like(image)
+            self.weight = np.zeros((*image.shape[:2], 1))
+        finite = np.isfinite(image).all(axis=-1, keepdims=True)
+        n_bad = finite.size - np.count_nonzero(finite)
+        self.total += spp * (np.where(finite, image, 0.0) if n_bad else image)
+        self.weight += spp * finite
+        self.nonfinite += n_bad
+        self.spp += spp
+
+    def mean(self) -> np.ndarray:
+        """The mean so far, float32; black where no pass was finite."""
+        return (self.total / np.maximum(self.weight, 1.0)).astype(np.float32)
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# One pass
+
+
+def pass_seed(seed: int, stream: int, index: int) -> int:
+    """A 32-bit seed for one pass. Hashed, so that runs with neighbouring seeds have no pass in common."""
+    return int(np.random.SeedSequence((seed, stream, index)).generate_state(1)[0])
+
+
+def clock() -> float:
+    """Seconds, after all work that was given to Dr.Jit is done."""
+    import drjit as dr
+
+    dr.sync_thread()
+    return time.perf_counter()
+
+
+def render_pass(scene, integrator, spp: int, seed: int, sensor: int = 0) -> np.ndarray:
+    """One developed film as an array of shape (height, width, channels).
+
+    What ``mi.render`` does without gradients. That function itself turns every exception into a ``RuntimeError`` of its
+    own, Ctrl-C and an integrator's message to the user included.
+    """
+    import drjit as dr
+
+    camera = scene.sensors()[sensor]
+    with dr.suspend_grad():
+        image = integrator.render(scene=scene, sensor=camera, seed=seed, spp=spp, develop=True, evaluate=False)
+        result = np.array(image)
+        camera.sampler().seed(0, 1)  # or the sampler's state keeps the loop of this pass alive
+    return result
+
+
+def statistics(integrator) -> dict[str, float]:
+    """What the integrator counts about itself; empty for one that counts nothing."""
+    return dict(integrator.statistics()) if hasattr(integrator, "statistics") else {}
+
+
+def reset(integrator) -> None:
+    """Forget what was learned, where there is something to forget."""
+    if hasattr(integrator, "reset"):
+        integrator.reset()
+
+
+def pixels(scene, sensor: int = 0) -> int:
+    """Pixels of the film that are rendered."""
+    width, height = scene.sensors()[sensor].film().crop_size()
+    return int(width) * int(height)
+
+
+def pass_sizes(scene, sensor: int = 0) -> list[int]:
+    """The entries of PASS_SPP whose passes hold at most PASS_SAMPLES samples; 1 always."""
+    n = pixels(scene, sensor)
+    return [spp for spp in PASS_SPP if spp == 1 or spp * n <= PASS_SAMPLES]
+
+
+def warm_up(scene, integrator, spps: list[int], seed: int = 0, sensor: int = 0) -> float:
+    """Compile every kernel that rendering with these samples a pixel needs; returns the seconds it took.
+
+    An integrator with `prepare` does it without a trace in its state; for others a render is thrown away.
+    """
+    start = clock()
+    for index, spp in enumerate(spps):
+        if hasattr(integrator, "prepare"):
+            integrator.prepare(scene, sensor=sensor, spp=spp)
+        else:
+            render_pass(scene, integrator, spp, pass_seed(seed, STREAM_WARM_UP, index), sensor)
+    return clock() - start
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Many passes
+
+
+def train(scene, integrator, frames: int, sensor: int = 0, progress: Progress | None = None) -> tuple[float, bool]:
+    """Train that many frames; returns (seconds, interrupted). Does nothing for an integrator without a cache."""
+    if frames <= 0 or not hasattr(integrator, "train"):
+        return 0.0, False
+    start, interrupted = clock(), False
+    try:
+        integrator.train(scene, frames, sensor=sensor, progress=progress)
+    except KeyboardInterrupt:
+        interrupted = True
+    return clock() - start, interrupted
+
+
+def render_samples(
+    scene, integrator, spp: int, seed: int = 0, sensor: int = 0, progress: Progress | None = None
+) -> Rendered:
+    """Render `spp` samples a pixel. The division into passes depends on film and `spp` alone, and so does the image."""
+    run = _Run(scene, integrator, seed, sensor)
+    try:
+        for n in plan_passes(scene, spp, sensor):
+            run.one_pass(n)
+            if progress:
+                progress(run.film.spp, spp)
+    except KeyboardInterrupt:
+        run.interrupted = True
+    return run.result()
+
+
+def plan_passes(scene, spp: int, sensor: int = 0) -> list[int]:
+    """Samples a pixel of each pass of :func:`render_samples`: equal powers of two and a rest."""
+    size = 1
+    while size * 2 <= spp and size * 2 * pixels(scene, sensor) <= PASS_SAMPLES:
+        size *= 2
+    return [size] * (spp // size) + ([spp % size] if spp % size else [])
+
+
+def render_seconds(
+    scene,
+    integrator,
+    seconds: float,
+    seed: int = 0,
+    sensor: int = 0,
+    progress: Progress | None = None,
+    pretrained: bool = False,
+    pass_times: dict[int, float] | None = None,
+) -> Rendered:
+    """Render as many samples as fit into `seconds` of wall time, kernels being compiled (:func:`warm_up`).
+
+    An integrator with `train_fraction` first trains for that share of the time, unless it is `pretrained`. Passes then
+    have 1, 4, 16 or 64 samples a pixel: the largest that is expected to end in time, by the times of earlier passes.
+    The last pass may end up to half of a 1-sample pass late. At least one pass is rendered, however small the budget.
+
+    `pass_times` (samples a pixel -> seconds) is read and updated: hand the same to every frame of a sequence.
+    """
+    start = clock()
+    run = _Run(scene, integrator, seed, sensor)
+    times = {} if pass_times is None else pass_times
+    sizes = pass_sizes(scene, sensor)
+    try:
+        fraction = (
+            0.0 if pretrained or not hasattr(integrator, "train_fraction") else integrator.train_fraction(seconds)
+        )
+        if fraction > 0.0:
+            run.train_seconds(fraction * seconds)
+        while True:
+            elapsed = clock() - start
+            if progress:
+                progress(min(elapsed, seconds), seconds)
+            size = choose_pass(sizes, times, seconds - elapsed)
+            if size is None and run.film.spp:
+                break
+            size = size or sizes[0]
+            times[size] = run.one_pass(size)
+    except KeyboardInterrupt:
+        run.interrupted = True
+        if run.film.spp == 0:
+            run.one_pass(sizes[0])
+    return run.result()
+
+
+def choose_pass(sizes: list[int], times: dict[int, float], remaining: float) -> int | None:
+    """The largest pass that should end within `remaining` seconds, the smallest if half of it fits, else None.
+
+    A size not yet timed is expected to cost as much a sample as the nearest one that was, which errs on the long side
+    for larger passes.
+    """
+    if not times:
+        return sizes[0] if remaining > 0.0 else None
+
+    def expected(size: int) -> float:
+        known = min(times, key=lambda other: abs(np.log(other / size)))
+        return times[known] * size / known
+
+    fitting = [size for size in sizes if expected(size) <= min(remaining, PASS_SECONDS)]
+    if fitting:
+        return max(fitting)
+    return sizes[0] if 0.5 * expected(sizes[0]) <= remaining else None
+
+
+class _Run:
+    """The state of one rendering: film, clocks, number of passes."""
+
+    def __init__(self, scene, integrator, seed: int, sensor: int) -> None:
+        self.scene, self.integrator, self.seed, self.sensor = scene, integrator, seed, sensor
+        self.film = Accumulator()
+        self.n_passes = 0
+        self.seconds_train = self.seconds_render = 0.0
+        self.interrupted = False
+
+    def train_seconds(self, seconds: float) -> None:
+        start = clock()
+        try:
+            self.integrator.train_seconds(self.scene, seconds, sensor=self.sensor)
+        finally:
+            self.seconds_train += clock() - start
+
+    def one_pass(self, spp: int) -> float:
+        """Render and accumulate one pass; returns its seconds without such training as happened inside."""
+        trained_before = statistics(self.integrator).get("seconds_train", 0.0)
+        start = clock()
+        seed = pass_seed(self.seed, STREAM_IMAGE, self.n_passes)
+        self.film.add(render_pass(self.scene, self.integrator, spp, seed, self.sensor), spp)
+        self.n_passes += 1
+        seconds = clock() - start
+        trained = min(max(0.0, statistics(self.integrator).get("seconds_train", 0.0) - trained_before), seconds)
+        self.seconds_train += trained
+        self.seconds_render += seconds - trained
+        return seconds - trained
+
+    def result(self) -> Rendered:
+        if self.film.spp == 0:
+            raise KeyboardInterrupt("interrupted before the first samples were there")
+        names = self.integrator.aov_names() if hasattr(self.integrator, "aov_names") else []
+        rgb, channels = split_channels(self.film.mean(), list(names))
+        return Rendered(
+            rgb=rgb.astype(np.float32),
+            channels={name: values.astype(np.float32) for name, values in channels.items()},
+            spp=self.film.spp,
+            nonfinite=self.film.nonfinite,
+            seconds_train=self.seconds_train,
+            seconds_render=self.seconds_render,
+            statistics=statistics(self.integrator),
+            interrupted=self.interrupted,
+        )

@@ -1,0 +1,61 @@
+"""What a measurement was made with: versions, cores, back ends."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+#: Distributions whose versions belong to a result; the last one is optional.
+DISTRIBUTIONS = ("mitsuba", "drjit", "numpy", "OpenEXR", "flip-evaluator", "mitsuba-oidn")
+
+
+def describe() -> dict[str, object]:
+    """Versions, variant, processor, cores and LLVM as a dictionary that JSON can hold. Missing packages are None."""
+    import mitsuba as mi
+
+    import mi_neural
+
+    llvm = mi_neural.llvm.describe()
+    return {
+        "mi_neural": mi_neural.__version__,
+        **{name: _version(name) for name in DISTRIBUTIONS},
+        "python": platform.python_version(),
+        "variant": mi.variant(),
+        "cpu": processor(),
+        "cores": cores(),
+        "threads": _threads(),
+        "llvm": llvm.get("version"),
+        "llvm_source": llvm.get("source"),
+        "system": platform.platform(),
+    }
+
+
+def cores() -> int:
+    """Cores this process may run on, which in a container are fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor() -> str:
+    """The processor's name as its maker writes it, where the system tells."""
+    if sys.platform == "linux":
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _threads() -> int:
+    """Worker threads that Dr.Jit renders with."""
+    import drjit as dr
+
+    return dr.thread_count()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,105 @@
+"""Make the plugins known to Mitsuba, once per variant, whenever a variant is set.
+
+A plugin class derives from classes of one variant (``mi.SamplingIntegrator`` is another class after each
+``mi.set_variant``), so its module is executed once per variant. Each variant keeps its own module objects: what was
+made under one variant still works after a visit to another.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from types import ModuleType
+
+from . import llvm
+
+# The variants in which the plugins work: RGB, differentiable (training), on a JIT backend.
+SUPPORTED = ("llvm_ad_rgb", "cuda_ad_rgb")
+
+# (package, variant) -> the modules of that package as executed under that variant
+_modules: dict[tuple[str, str], dict[str, ModuleType]] = {}
+
+
+def variant_problem(variant: str | None = None) -> str | None:
+    """Why the plugins cannot run under ``variant`` (default: the current one) and what to type; None if they can."""
+    import mitsuba as mi
+
+    variant = variant or mi.variant()
+    if variant in SUPPORTED:
+        return None
+    fix = 'type: mi.set_variant("llvm_ad_rgb") (CPU) or mi.set_variant("cuda_ad_rgb") (NVIDIA)'
+    if variant is None:
+        return f"no Mitsuba variant is set; {fix}"
+    if variant.startswith("scalar"):
+        why = "scalar variants have no Dr.Jit compiler to train a cache with"
+    elif "polarized" in variant:
+        why = "the caches do not track polarization"
+    elif "spectral" in variant or "mono" in variant:
+        why = "the caches hold RGB radiance"
+    elif "_ad_" not in variant:
+        why = "a cache is trained by automatic differentiation"
+    else:
+        why = "it is untested"
+    return f'mi_neural does not support the variant "{variant}": {why}; {fix}'
+
+
+def register() -> None:
+    """Register the plugins for the current variant, if one is set, and for every variant set from now on."""
+    import mitsuba as mi
+
+    mi.detail.remove_variant_callback(_on_variant)  # no effect unless called a second time
+    mi.detail.add_variant_callback(_on_variant)
+    llvm.check(mi.variant())
+    if mi.variant() is not None:
+        _register_for(mi.variant())
+
+
+def plugin_names(package: ModuleType) -> tuple[str, ...]:
+    """The entries of ``package.PLUGINS`` whose modules exist."""
+    return tuple(n for n in package.PLUGINS if importlib.util.find_spec(f"{package.__name__}.{n}"))
+
+
+def _on_variant(old: str | None, new: str) -> None:
+    llvm.check(new)
+    _register_for(new)
+
+
+def _register_for(variant: str) -> None:
+    import mitsuba as mi
+
+    from . import emitters, integrators
+
+    for package, register_plugin in ((emitters, mi.register_emitter), (integrators, mi.register_integrator)):
+        if (text := variant_problem(variant)) is None:
+            _load(package, variant)
+        else:
+            for name in plugin_names(package):
+                register_plugin(name, _refusal(name, text))
+
+
+def _load(package: ModuleType, variant: str) -> None:
+    """Put ``variant``'s modules of ``package`` into place; the first visit executes those of ``package.PLUGINS``."""
+    prefix = f"{package.__name__}."
+    for name in [n for n in sys.modules if n.startswith(prefix)]:
+        del sys.modules[name]
+
+    known = _modules.get((package.__name__, variant))
+    if known is None:
+        for name in plugin_names(package):
+            importlib.import_module(prefix + name)
+        known = {n: m for n, m in sys.modules.items() if n.startswith(prefix)}
+        _modules[package.__name__, variant] = known
+
+    sys.modules.update(known)
+    for name, module in known.items():
+        setattr(package, name.removeprefix(prefix), module)
+
+
+def _refusal(name: str, text: str):
+    """A plugin constructor that only says why there is none."""
+
+    def refuse(props):
+        raise RuntimeError(f'"{name}": {text}')
+
+    return refuse

@@ -1,0 +1,1 @@
+"""What is traced: path vertices, training records, termination, estimators as functions of samples."""

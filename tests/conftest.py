@@ -1,0 +1,74 @@
+"""What all tests share: one variant, fixed seeds, fresh interpreters, the scenes beside the checkout.
+
+The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest` runs the same tests on a GPU.
+"""
+
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import mi_neural  # first: it chooses the LLVM library
+
+import mitsuba as mi  # isort: skip
+import numpy as np
+import pytest
+
+VARIANT = os.environ.get("MI_NEURAL_TEST_VARIANT", "llvm_ad_rgb")
+ROOT = Path(__file__).resolve().parents[1]
+
+if text := mi_neural.variant_problem(VARIANT):
+    raise pytest.UsageError(f"MI_NEURAL_TEST_VARIANT: {text}")
+mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
+
+
+@pytest.fixture(autouse=True)
+def _same_start_for_every_test():
+    mi.set_variant(VARIANT)
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 (for libraries that draw from the global state)
+    yield
+    mi.set_variant(VARIANT)
+
+
+@pytest.fixture
+def variant() -> str:
+    """The variant the tests run under."""
+    return VARIANT
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """NumPy's generator with a fixed seed."""
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The root of the checkout."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def shared_scenes() -> Path:
+    """The folder of well-known scenes with references beside the checkout; tests skip where it is absent."""
+    path = ROOT.parent / "shared" / "scenes"
+    if not path.is_dir():
+        pytest.skip("no ../shared/scenes beside the checkout: the well-known scenes are not shipped with the package")
+    return path
+
+
+@pytest.fixture
+def run_python(tmp_path):
+    """`run_python(code, VAR="...")`: code in a fresh interpreter, without our choice of LLVM; `ok=False`: may fail."""
+
+    def run(code: str, ok: bool = True, **env: str) -> subprocess.CompletedProcess:
+        base = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=base | env, cwd=tmp_path, capture_output=True, text=True, timeout=300
+        )
+        assert not ok or done.returncode == 0, f"exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
+        return done
+
+    return run

@@ -1,0 +1,327 @@
+"""Budgets, passes, references and rows, with Mitsuba's `path` and with a cache that is one number."""
+
+import json
+import time
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fake_cache import register
+
+from mi_neural.measure import benchmark, budget, denoise, exr, load, reference, report
+
+SIZE = (16, 12)
+#: Keys that results must hold, by the contract of the command line.
+KEYS = (
+    "scene integrator parameters size spp seconds_compile seconds_train seconds_render ns_per_sample ns_per_query "
+    "records queries mean nonfinite relmse relmse_trimmed flip environment"
+).split()
+
+
+@pytest.fixture
+def loaded() -> load.LoadedScene:
+    register()
+    return load.load_scene("cornell_box", SIZE)
+
+
+@pytest.fixture
+def path():
+    return mi.load_dict({"type": "path", "max_depth": 4})
+
+
+def fake(**keys):
+    register()
+    return mi.load_dict({"type": "fake_cache", "max_depth": 3, **keys})
+
+
+# ---------------------------------------------------------------- passes
+
+
+def test_accumulator_weighs_by_samples_and_leaves_out_nonfinite_pixels():
+    film = budget.Accumulator()
+    first, second = np.full((2, 2, 3), 1.0), np.full((2, 2, 3), 4.0)
+    second[0, 0, 1], first[1, 1], second[1, 1] = np.nan, np.inf, np.inf
+    film.add(first, 1)
+    film.add(second, 2)
+    assert film.mean()[0, 1] == pytest.approx(3.0)
+    assert film.mean()[0, 0] == pytest.approx(1.0)  # the first pass alone
+    assert film.mean()[1, 1] == pytest.approx(0.0)  # none was finite
+    assert (film.nonfinite, film.spp) == (3, 3)
+
+
+def test_seeds_of_passes_differ():
+    seeds = {budget.pass_seed(s, t, k) for s in range(5) for t in range(4) for k in range(50)}
+    assert len(seeds) == 5 * 4 * 50
+
+
+def test_passes_are_chosen_to_end_in_time():
+    sizes = [1, 4, 16]
+    assert budget.choose_pass(sizes, {}, 1.0) == 1
+    assert budget.choose_pass(sizes, {}, 0.0) is None
+    assert budget.choose_pass(sizes, {1: 0.01}, 1.0) == 16
+    assert budget.choose_pass(sizes, {1: 0.01, 16: 0.12}, 0.05) == 4
+    assert budget.choose_pass(sizes, {1: 0.01}, 0.006) == 1  # more than half of it fits
+    assert budget.choose_pass(sizes, {1: 0.01}, 0.004) is None
+    assert budget.choose_pass(sizes, {1: 0.5}, 60.0) == 1  # no pass is longer than a second
+    assert budget.choose_pass(sizes, {1: 5.0}, 60.0) == 1  # but for the smallest
+
+
+def test_plan_of_passes_adds_up(loaded):
+    for spp in (1, 3, 16, 100):
+        assert sum(budget.plan_passes(loaded.scene, spp)) == spp
+    assert max(budget.plan_passes(loaded.scene, 100_000)) * SIZE[0] * SIZE[1] <= budget.PASS_SAMPLES
+
+
+def test_same_seed_same_image(loaded, path):
+    first, again = (budget.render_samples(loaded.scene, path, 5, seed=3) for _ in range(2))
+    other = budget.render_samples(loaded.scene, path, 5, seed=4)
+    assert np.allclose(first.rgb, again.rgb, rtol=1e-5)
+    assert not np.allclose(first.rgb, other.rgb, rtol=1e-2)
+    assert first.rgb.shape == (SIZE[1], SIZE[0], 3) and first.spp == 5
+
+
+def test_mean_of_passes_is_the_mean_of_the_integrator(loaded, path):
+    passes = budget.render_seconds(loaded.scene, path, 0.5)
+    whole = np.array(mi.render(loaded.scene, integrator=path, spp=512, seed=1))
+    assert passes.spp > 16
+    assert passes.rgb.mean() == pytest.approx(whole.mean(), rel=0.1)
+
+
+def test_budget_is_met(loaded, path):
+    budget.warm_up(loaded.scene, path, budget.pass_sizes(loaded.scene))
+    start = time.perf_counter()
+    rendered = budget.render_seconds(loaded.scene, path, 0.4)
+    assert 0.35 < time.perf_counter() - start < 0.8  # a loaded machine may make the last pass late
+    assert 0.3 < rendered.seconds_render < 0.8 and rendered.seconds_train == 0.0
+
+
+def test_training_is_part_of_the_budget(loaded):
+    integrator = fake(fraction=0.5)
+    rendered = budget.render_seconds(loaded.scene, integrator, 0.4)
+    assert 0.2 <= rendered.seconds_train < 0.4
+    assert 0.0 < rendered.seconds_render < 0.6
+    assert rendered.statistics["records"] == 10
+    assert (rendered.channels["frames"] == 10).all()
+
+    integrator.reset()
+    rendered = budget.render_seconds(loaded.scene, integrator, 0.1, pretrained=True)
+    assert rendered.seconds_train == 0.0 and integrator.frames == 0
+
+
+def test_a_tiny_budget_still_gives_an_image(loaded, path):
+    assert budget.render_seconds(loaded.scene, path, 1e-6).spp == 1
+
+
+def test_warm_up_uses_what_leaves_no_trace(loaded):
+    integrator = fake()
+    budget.warm_up(loaded.scene, integrator, [1, 4])
+    assert (integrator.n_prepared, integrator.n_renders, integrator.frames) == (2, 0, 0)
+
+
+def test_interrupted_rendering_keeps_the_image_so_far(loaded):
+    rendered = budget.render_seconds(loaded.scene, fake(interrupt_render=3, fraction=0.0), 60.0)
+    assert rendered.interrupted and rendered.spp > 0 and rendered.rgb.mean() > 0.0
+    with pytest.raises(KeyboardInterrupt, match="before the first samples"):
+        budget.render_samples(loaded.scene, fake(interrupt_render=1), 4)
+
+
+def test_interrupted_training_still_renders_a_pass(loaded):
+    rendered = budget.render_seconds(loaded.scene, fake(interrupt_train=True), 60.0)
+    assert rendered.interrupted and rendered.spp == 1
+
+
+def test_nonfinite_pixels_are_counted(loaded):
+    rendered = budget.render_samples(loaded.scene, fake(nan=True), 1)
+    assert rendered.nonfinite == SIZE[0] * SIZE[1] and (rendered.rgb == 0.0).all()
+
+
+# ---------------------------------------------------------------- scenes, integrators, references
+
+
+def test_size_overrides_film_and_crop(tmp_path):
+    scene = tmp_path / "cropped.xml"
+    scene.write_text("""<scene version="3.0.0">
+        <default name="depth" value="3"/>
+        <integrator type="path"> <integer name="max_depth" value="$depth"/> </integrator>
+        <sensor type="perspective">
+            <film type="hdrfilm">
+                <integer name="width" value="64"/> <integer name="height" value="32"/>
+                <integer name="crop_width" value="8"/> <integer name="crop_height" value="32"/>
+                <integer name="crop_offset_x" value="4"/> <integer name="crop_offset_y" value="0"/>
+            </film>
+        </sensor>
+        <emitter type="constant"/>
+    </scene>""")
+    assert load.load_scene(str(scene)).size == (8, 32)
+    assert load.load_scene(str(scene), (20, 10)).size == (20, 10)
+    assert load.load_scene(str(scene), None, {"depth": "7"}).carried == {"max_depth": 7}
+    with pytest.raises(load.InputError, match=r"no parameter foo; it has: depth"):
+        load.load_scene(str(scene), None, {"foo": "1"})
+
+
+def test_keys_are_typed():
+    spec = load.parse_integrator("nirc:a=8,b=0.5,c=true,d=text,e.f=1e-3")
+    assert spec.keys == {"a": 8, "b": 0.5, "c": True, "d": "text", "e.f": 1e-3}
+    assert [type(v) for v in spec.keys.values()] == [int, float, bool, str, float]
+    assert spec.label == "nirc:a=8,b=0.5,c=true,d=text,e.f=0.001"
+
+
+def test_depth_is_carried_where_it_is_known():
+    carried = {"max_depth": 5, "hide_emitters": True}
+    _, keys = load.build_integrator(load.IntegratorSpec("path", {"max_depth": 3}), carried)
+    assert keys == {"max_depth": 3, "hide_emitters": True}
+    _, keys = load.build_integrator(load.IntegratorSpec("direct"), carried)
+    assert keys == {"hide_emitters": True}
+
+
+def test_reference_is_kept_continued_and_found_again(loaded, tmp_path):
+    size = reference.pass_spp(loaded.scene)
+    first = reference.render_reference(loaded, 4 * size, tmp_path)
+    more = reference.render_reference(loaded, 8 * size, tmp_path)
+    again = reference.render_reference(loaded, 2 * size, tmp_path)
+    assert first.path == more.path and np.array_equal(again.rgb, more.rgb)
+    assert [int(r.metadata["spp"]) for r in (first, more, again)] == [4 * size, 8 * size, 8 * size]
+
+    # As if it had been rendered at once
+    (whole := tmp_path / "whole").mkdir()
+    at_once = reference.render_reference(loaded, 8 * size, whole)
+    assert np.allclose(at_once.rgb, more.rgb, rtol=1e-3, atol=1e-5)
+    assert np.allclose(at_once.variance, more.variance, rtol=1e-2, atol=1e-7)
+    assert 0.0 < more.noise_floor() < first.noise_floor()
+
+
+def test_variance_of_a_reference_is_that_of_its_mean(tmp_path):
+    loaded = load.load_scene("cornell_box", SIZE, integrator_keys={"max_depth": 2})  # direct light: no fireflies
+    found = reference.render_reference(loaded, 8 * reference.pass_spp(loaded.scene), tmp_path)
+    (tmp_path / "other").mkdir()
+    other = reference.render_reference(loaded, 8 * reference.pass_spp(loaded.scene), tmp_path / "other", seed=1)
+    squared, variance = (found.rgb - other.rgb) ** 2, found.variance + other.variance
+    # 7 degrees of freedom each: E chi^2_1 / (chi^2_14 / 14) = 14 / 12
+    lit = variance > 0.0
+    assert (squared[lit] / variance[lit]).mean() == pytest.approx(14 / 12, rel=0.25)
+
+
+def test_interrupted_reference_keeps_its_passes(loaded, tmp_path):
+    size = reference.pass_spp(loaded.scene)
+
+    def stop(done, total):
+        if done == 3 * size:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reference.render_reference(loaded, 8 * size, tmp_path, stop)
+    kept = reference.load_reference(reference.reference_path(loaded, tmp_path))
+    assert int(kept.metadata["spp"]) == 3 * size
+
+
+def test_unusable_references_are_refused(tmp_path):
+    file = tmp_path / "r.exr"
+    with pytest.raises(load.InputError, match="no reference"):
+        reference.load_reference(file)
+    exr.write(file, np.ones((4, 6, 3)))
+    assert reference.load_reference(file, (6, 4)).variance is None
+    with pytest.raises(load.InputError, match=r"6x4.*8x4.*--size 6x4"):
+        reference.load_reference(file, (8, 4))
+    exr.write(file, np.full((4, 6, 3), np.nan))
+    with pytest.raises(load.InputError, match="24 non-finite"):
+        reference.load_reference(file)
+
+
+def test_another_depth_is_noticed():
+    def with_depth(depth):
+        return reference.Reference(np.ones((1, 1, 3)), None, {"max_depth": depth}, None)
+
+    assert "max_depth=64" in reference.depth_warning(with_depth("64"), 12)
+    assert reference.depth_warning(with_depth("12"), 12) is None
+    assert reference.depth_warning(with_depth("-1"), 4294967295) is None
+    assert reference.depth_warning(reference.Reference(np.ones((1, 1, 3)), None, {}, None), 12) is None
+
+
+# ---------------------------------------------------------------- rows and reports
+
+
+@pytest.fixture
+def measured(loaded, tmp_path):
+    """A comparison of `path` with the fake cache: (pictures, reference)."""
+    ref = reference.render_reference(loaded, 64, tmp_path)
+    specs = [load.parse_integrator(text) for text in ("path", "fake_cache:fraction=0.25")]
+    cases = benchmark.make_cases(loaded, specs, {"max_depth": 4})
+    guides = denoise.render_guides(loaded.scene) if has_denoiser() else None
+    pictures = []
+    bench = benchmark.Bench(loaded, ref, guides, {"cores": 1}, pictures.append)
+    bench.run(cases, benchmark.Plan([0.05, 0.1], 3, [0.05]))
+    return pictures, ref
+
+
+def has_denoiser() -> bool:
+    try:
+        denoise.require()
+    except load.InputError:
+        return False
+    return True
+
+
+def test_rows_hold_what_the_contract_names(measured):
+    pictures, _ = measured
+    rows = [p.row for p in pictures]
+    for row in rows:
+        facts = json.loads(json.dumps(row.to_json(), allow_nan=False))
+        assert set(KEYS) <= facts.keys()
+        assert facts["parameters"]["max_depth"] == 4
+        assert row.relmse > 0.0 and row.flip > 0.0 and row.environment == {"cores": 1}
+        assert row.seconds_total == row.seconds_train + row.seconds_render + row.seconds_denoise
+    variants = 2 if has_denoiser() else 1
+    modes = [row.mode for row in rows if row.label == "path"]
+    assert modes == ["one-shot"] * 2 * variants + ["sample"] * variants + ["steady"] * variants
+
+    cached = [row for row in rows if row.integrator == "fake_cache"]
+    assert 0.25 * 0.05 <= cached[0].seconds_train < 0.1
+    steady = next(row for row in cached if row.mode == "steady")
+    assert steady.pretrain_frames == 3 and steady.frames == benchmark.STEADY_FRAMES and steady.seconds_train == 0.0
+    assert steady.flicker > 0.0 and cached[0].flicker is None
+    assert steady.records == 3, "one-shot runs before it must leave nothing in the cache"
+
+
+def test_ns_per_sample_is_time_over_samples(measured):
+    row = measured[0][0].row
+    assert row.ns_per_sample == pytest.approx(1e9 * row.seconds_render / (SIZE[0] * SIZE[1] * row.spp))
+
+
+def test_report_is_one_file_that_loads_nothing(measured, tmp_path):
+    pictures, ref = measured
+    rows = [p.row for p in pictures]
+    found = report.Report("a<b", SIZE, "mi-neural compare", {"cores": 1}, rows, pictures, ref, ["a & b"])
+    report.write(found, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 2 * len(pictures) + 1
+    assert "a&lt;b" in page and "a &amp; b" in page and page.count("<svg") == 2
+    for outside in ('src="http', "url(http", "<link", "@import", "fetch("):
+        assert outside not in page
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert len(results["rows"]) == len(rows) and results["reference"]["variance_subtracted"] is True
+    table = (tmp_path / "table.md").read_text().splitlines()
+    assert len(table) == len(rows) + 2 and len({line.count("|") for line in table}) == 1
+
+
+def test_a_key_that_no_integrator_knows_is_refused(loaded):
+    with pytest.raises(load.InputError, match="none of path, direct has a key 'zork'"):
+        benchmark.make_cases(loaded, [load.IntegratorSpec("path"), load.IntegratorSpec("direct")], {"zork": 1})
+
+
+def test_denoiser_lowers_the_error(path, tmp_path):
+    if not has_denoiser():
+        pytest.skip("mitsuba-oidn is not installed")
+    from mi_neural.measure import metrics
+
+    loaded = load.load_scene("cornell_box", (64, 64), integrator_keys={"max_depth": 4})
+    ref = reference.render_reference(loaded, 64, tmp_path)
+    noisy = budget.render_samples(loaded.scene, path, 2).rgb
+    clean, seconds = denoise.denoise(noisy, denoise.render_guides(loaded.scene))
+    assert seconds > 0.0 and clean.shape == noisy.shape
+    assert metrics.relmse_trimmed(clean, ref.rgb) < metrics.relmse_trimmed(noisy, ref.rgb)
+
+
+def test_missing_denoiser_says_what_to_type(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mitsuba_oidn", None)
+    with pytest.raises(load.InputError, match=r"pip install 'mi_neural\[denoise\]'"):
+        denoise.require()
