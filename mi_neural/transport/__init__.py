@@ -1,1 +1,1 @@
-"""What is traced: path vertices, training records, termination, estimators as functions of samples."""
+"""What is traced: path vertices, training paths, termination, sample sequences. No module here knows a plugin."""

@@ -1,0 +1,459 @@
+"""What integrators with a cache share: keys, the life of a frame, passes, statistics, cache files."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_neural.caches.field import CacheFileError, Field, FieldShape
+from mi_neural.caches.incident import IncidentCache, Training
+from mi_neural.transport.samples import PathSampler
+
+#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (measured, README).
+PASS_SAMPLES = 2**20
+#: Frames that `train_frames = -1` trains at least and at most.
+SETTLE_FRAMES = (128, 400)
+
+SHARED_KEYS = """
+     * - max_depth
+       - |int|
+       - Longest *traced* path in segments; -1 means no limit. Up to 2 the result is that of ``path`` (no cache is
+         asked). Beyond, light from the cache has been reflected any number of times: compare with an unlimited
+         ``path``. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth from which Russian roulette may end a traced path. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Leave out what the camera sees of emitters directly. (Default: false)
+     * - train_frames
+       - |int|
+       - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
+     * - train_samples
+       - |int|
+       - Training paths per frame. (Default: 4096)
+     * - train_vertices
+       - |int|
+       - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)
+     * - train_steps
+       - |int|
+       - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
+     * - learning_rate
+       - |float|
+       - Of Adam, at the start; falls to a tenth. (Default: 0.01)
+     * - ema_decay
+       - |float|
+       - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)
+     * - freeze_cache
+       - |bool|
+       - Do not train at all; an untrained cache answers with a constant. (Default: false)
+     * - seed
+       - |int|
+       - Of the initial weights and the training paths. (Default: 0)
+     * - levels
+       - |int|
+       - Levels of the hash grid, two features each. (Default: 8)
+     * - hashmap_size
+       - |int|
+       - Most entries of a level. (Default: 32768)
+     * - width
+       - |int|
+       - Of the network's hidden layers. (Default: 32)
+     * - hidden_layers
+       - |int|
+       - Their number. (Default: 2)
+     * - channels
+       - |string|
+       - Extra channels to write, a comma-separated list; the plugin says which. (Default: none)
+"""
+
+
+def scene_signature(scene) -> str:
+    """A short hash of what makes a scene another scene: its shapes, their primitives, its emitters and extent."""
+    box = scene.bbox()
+    facts = (
+        sorted(int(s.primitive_count()) for s in scene.shapes()),
+        len(scene.emitters()),
+        [float(f"{float(v):.4g}") for v in (*box.min, *box.max)],
+    )
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+
+
+def check_scene(scene, plugin: str) -> None:
+    """Refuse, before any work, a scene that cannot be rendered; the message says what to do."""
+    if not scene.sensors():
+        raise ValueError(f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>")
+    if not scene.emitters():
+        raise ValueError(f"{plugin}: the scene has no emitter, the image would be black; add a light")
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            raise ValueError(
+                f"{plugin}: shape '{shape.id()}' borders a participating medium, which the cache does not model; "
+                'use <integrator type="volpath"/>'
+            )
+
+
+class _State:
+    """What changes from image to image. Apart, because a frozen function is recorded anew whenever an attribute of the
+    integrator that it belongs to changes; this object it takes as a whole."""
+
+    def __init__(self):
+        self.passes: dict = {}
+        self.planned_spp: int | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        self.scene_key = self.signature = None
+        self.images = 0
+        self.queries = 0.0
+        self.nonfinite: list = []
+        self.ns_per_query = math.nan
+
+
+class CacheIntegrator(mi.SamplingIntegrator):
+    """Base of the integrators that train a cache of incident radiance. Subclasses give `estimate`.
+
+    The state lives from one ``render`` call to the next; another scene starts it anew.
+    """
+
+    #: Extra channels: name -> number of values (3: R, G, B)
+    CHANNELS: dict[str, int] = {}  # noqa: RUF012
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.plugin = props.plugin_name()
+        self.max_depth = props.get("max_depth", -1)
+        self.rr_depth = props.get("rr_depth", 5)
+        self.hide = props.get("hide_emitters", False)
+        self.train_frames = props.get("train_frames", -1)
+        self.train_steps = props.get("train_steps", 1)
+        self.freeze_cache = props.get("freeze_cache", False)
+        self.seed = props.get("seed", 0)
+        self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
+        self._check(self.rr_depth >= 1, f"rr_depth is {self.rr_depth}; it must be at least 1")
+        self._check(self.train_frames >= -1, f"train_frames is {self.train_frames}; give -1 (until settled), 0 or more")
+        self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
+        self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
+        try:
+            training = Training(
+                n_paths=props.get("train_samples", 4096),
+                n_vertices=props.get("train_vertices", 8),
+                learning_rate=props.get("learning_rate", 1e-2),
+                ema_decay=props.get("ema_decay", 0.99),
+            )
+            shape = FieldShape(
+                n_levels=props.get("levels", 8),
+                hashmap_size=props.get("hashmap_size", 2**15),
+                width=props.get("width", 32),
+                n_hidden=props.get("hidden_layers", 2),
+            )
+        except ValueError as e:
+            raise ValueError(f"{self.plugin}: {e}") from None
+        names = [n.strip() for n in props.get("channels", "").split(",") if n.strip()]
+        for n in names:
+            self._check(n in self.CHANNELS, f"unknown channel '{n}'; it has: {', '.join(self.CHANNELS)}")
+        self.channels = names
+
+        self.cache = IncidentCache(training, shape, seed=self.seed)
+        self.state = _State()
+        self.reset()
+
+    def _check(self, ok: bool, message: str) -> None:
+        if not ok:
+            raise ValueError(f"{self.plugin}: {message}")
+
+    # -------------------------------------------------------------------------------------------------------------
+    # To be given by the plugin
+
+    def estimate(self, scene, field, sampler, ray, mixture, active):
+        """Radiance along camera rays: (L, valid, {channel: value})."""
+        raise NotImplementedError
+
+    @property
+    def needs_cache(self) -> bool:
+        """Whether the settings can lead to a query at all."""
+        return self.max_depth < 0 or self.max_depth > 2
+
+    def mixture(self, spp: int) -> float:
+        """A number that depends on the image's sample count, handed on to `estimate`."""
+        return 0.0
+
+    @property
+    def queries_per_sample(self) -> float:
+        return 0.0
+
+    # -------------------------------------------------------------------------------------------------------------
+    # State
+
+    def reset(self) -> None:
+        """Forget what was learned; the next image trains anew. Compiled kernels are kept."""
+        self.cache.reset()
+        self.state.reset()
+
+    def _ready(self, scene, sensor, train: bool = True) -> None:
+        """See that there is a cache of this scene, trained as far as the keys say."""
+        key = (id(scene), len(scene.shapes()), len(scene.emitters()))
+        if key != self.state.scene_key:
+            check_scene(scene, self.plugin)
+            if self.state.scene_key is not None:
+                self.reset()
+            self.state.scene_key, self.state.signature = key, scene_signature(scene)
+        if not self.needs_cache:
+            return
+        with dr.resume_grad():
+            if self.cache.field is None:
+                self.cache.start(scene, sensor)
+            if train and not self.freeze_cache:
+                if self.state.images == 0 and self.cache.steps == 0:
+                    auto = self.train_frames < 0
+                    self.cache.train(scene, sensor, frames=None if auto else self.train_frames,
+                                     at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1])  # fmt: skip
+                else:
+                    self.cache.train(scene, sensor, frames=self.train_steps)
+
+    def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
+        """Train `frames` frames now. `progress` is called with (done, total). Returns :meth:`statistics`."""
+        sensor = self._sensor(scene, sensor)
+        self._ready(scene, sensor, train=False)
+        if self.needs_cache and not self.freeze_cache:
+            self.cache.train(scene, sensor, frames=frames, progress=progress)
+        return self.statistics()
+
+    def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
+        """Train for about `seconds` of wall time. Returns :meth:`statistics`."""
+        sensor = self._sensor(scene, sensor)
+        self._ready(scene, sensor, train=False)
+        if self.needs_cache and not self.freeze_cache:
+            self.cache.train(scene, sensor, seconds=seconds, progress=progress)
+        return self.statistics()
+
+    def train_fraction(self, seconds: float) -> float:
+        """Share of a one-shot budget that is best spent on training before the first sample."""
+        return 0.0 if self.freeze_cache or not self.needs_cache else 0.35
+
+    def plan_samples(self, spp: int | None) -> None:
+        """Say how many samples a pixel the finished image will have, when it is rendered in several calls."""
+        self.state.planned_spp = spp
+
+    def prepare(self, scene, sensor=0, spp: int = 1) -> None:
+        """Compile all that a render call with `spp` needs. What was learned so far stays as it is."""
+        sensor = self._sensor(scene, sensor)
+        images, queries = self.state.images, self.state.queries
+        untouched = self.cache.field is None
+        self._ready(scene, sensor, train=False)
+        if self.needs_cache:
+            state = None if untouched else self.cache.checkpoint()
+            if not self.freeze_cache:
+                for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
+                    self.cache.train_frame(scene, sensor)
+        with dr.suspend_grad():
+            for _ in range(2):
+                dr.eval(self._render(scene, sensor, 1, spp))
+        dr.sync_thread()
+        if self.needs_cache:
+            self.cache.rollback(state)
+        self.state.images, self.state.queries = images, queries
+
+    def statistics(self) -> dict:
+        """Facts since the last reset: training (see :class:`IncidentCache`), queries, non-finite samples."""
+        s = dict(self.cache.statistics)
+        s["nonfinite"] += sum(int(n[0]) for n in self.state.nonfinite)
+        s["queries"] = int(self.state.queries)
+        s["images"] = self.state.images
+        if self.cache.field is not None:
+            s["parameters"] = sum(int(np.prod(v.shape)) for v in self.cache.field.averaged.parameters().values())
+            s["scale"] = float(self.cache.field.scale[0])
+        if math.isfinite(self.state.ns_per_query):
+            s["ns_per_query"] = self.state.ns_per_query
+        return s
+
+    def measure_query(self, n: int = 2**18, directions: int = 8) -> float:
+        """Nanoseconds per cache query: positions encoded once, `directions` queries each, all counted. Also kept for
+        :meth:`statistics`."""
+        field = self.cache.field
+        if field is None:
+            raise RuntimeError(f"{self.plugin}: there is no cache yet; render an image or call train() first")
+
+        @dr.freeze
+        def run(field, seed):
+            sampler = PathSampler.make(dr.arange(mi.UInt32, n), seed)
+            low, inv = field.box_min, field.box_inv_extent
+            x = low + mi.Vector3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / inv
+            features = field.encode(x)
+
+            def ask(i, total, sampler):
+                w = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+                return i + 1, total + field.query(features, w), sampler
+
+            _, total, _ = dr.while_loop((mi.UInt32(0), mi.Color3f(0), sampler), lambda i, t, s: i < directions, ask)
+            return total
+
+        times = []
+        with dr.suspend_grad():
+            for k in range(7):
+                dr.sync_thread()
+                t0 = time.perf_counter()
+                dr.eval(run(field, mi.UInt32(k)))
+                dr.sync_thread()
+                times.append(time.perf_counter() - t0)
+        self.state.ns_per_query = float(np.median(times[2:])) / (n * directions) * 1e9
+        return self.state.ns_per_query
+
+    # -------------------------------------------------------------------------------------------------------------
+    # Cache files
+
+    def save_cache(self, path) -> None:
+        """Write the trained cache to `path`, whole or not at all."""
+        if self.cache.field is None:
+            raise RuntimeError(f"{self.plugin}: there is no cache to save yet; render an image or call train() first")
+        self.cache.field.save(path, plugin="nirc", scene=self.state.signature, statistics=dict(self.cache.statistics))
+
+    def load_cache(self, path, scene=None) -> None:
+        """Go on from a cache file. With `scene`, or once a scene was rendered: refuse a cache of another scene.
+
+        Raises `CacheFileError` (a ``ValueError``).
+        """
+        field, header = Field.load(path)
+        if field.shape != self.cache.shape:
+            raise CacheFileError(f"'{path}' holds a cache of {field.shape}, this integrator has {self.cache.shape}; "
+                                 "give it the same sizes")  # fmt: skip
+        if scene is not None:
+            self._ready(scene, self._sensor(scene, 0), train=False)
+        known = self.state.signature
+        if known is not None and header.get("scene") != known:
+            raise CacheFileError(f"'{path}' was trained in another scene (or its geometry has changed)")
+        self.cache.adopt(field)
+
+    # -------------------------------------------------------------------------------------------------------------
+    # Rendering
+
+    def _sensor(self, scene, sensor):
+        if isinstance(sensor, int):
+            if not scene.sensors():
+                check_scene(scene, self.plugin)
+            if not 0 <= sensor < len(scene.sensors()):
+                raise ValueError(f"{self.plugin}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
+            sensor = scene.sensors()[sensor]
+        return sensor
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
+        sensor = self._sensor(scene, sensor)
+        spp = spp or sensor.sampler().sample_count()
+        with dr.suspend_grad():
+            self._ready(scene, sensor)
+            block = self._render(scene, sensor, int(seed[0]) if hasattr(seed, "__len__") else int(seed), spp)
+            film = sensor.film()
+            film.prepare(self.aov_names())
+            film.put_block(block)
+            self.state.images += 1
+            result = film.develop() if develop else mi.TensorXf()
+            if evaluate:
+                dr.eval(result)
+            return result
+
+    def _render(self, scene, sensor, seed: int, spp: int):
+        """An image block with `spp` samples a pixel, in passes that fit memory."""
+        film = sensor.film()
+        film.prepare(self.aov_names())
+        block = film.create_block()
+        size = film.crop_size()
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        width, height = int(size[0]) + 2 * border, int(size[1]) + 2 * border
+        n_pixels = width * height
+        mixture = dr.opaque(mi.Float, self.mixture(self.state.planned_spp or spp))
+        box = film.rfilter().is_box_filter()
+        field = self.cache.field if self.needs_cache else None
+
+        # A row of pixels at a time if one sample of all is too much, else several samples at a time
+        done = 0
+        while done < spp:
+            n = min(spp - done, max(1, PASS_SAMPLES // n_pixels))
+            rows = height if n * n_pixels <= 2 * PASS_SAMPLES else max(1, PASS_SAMPLES // (n * width))
+            for y in range(0, height, rows):
+                n_rows = min(rows, height - y)
+                key = (id(scene), id(sensor), width, n_rows, n, box, border)
+                if key not in self.state.passes:
+                    self.state.passes[key] = self._frozen_pass(width, n_rows, n, border, box)
+                pos, values, n_bad = self.state.passes[key](
+                    scene, sensor, field, mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, done),
+                    dr.opaque(mi.UInt32, y), mixture,
+                )  # fmt: skip
+                self.state.nonfinite.append(n_bad)
+                block.set_coalesce(False)
+                block.put(pos, values)
+            done += n
+        self.state.queries += self.queries_per_sample * n_pixels * spp
+        if len(self.state.nonfinite) > 256:
+            self.state.nonfinite = [sum(self.state.nonfinite[1:], self.state.nonfinite[0])]
+            dr.eval(self.state.nonfinite)
+        return block
+
+    def _frozen_pass(self, width: int, n_rows: int, spp: int, border: int, box: bool):
+        """A function that renders `spp` samples of some rows and returns what the film's block takes."""
+
+        def render_pass(scene, sensor, field, seed, first_sample, first_row, mixture):
+            n = width * n_rows * spp
+            lane = dr.arange(mi.UInt32, n)
+            pixel = lane // spp + first_row * width
+            sample = lane % spp + first_sample
+            scramble, _ = mi.sample_tea_32(pixel, seed, 4)
+            sampler = PathSampler.make(
+                pixel + sample * mi.UInt32(0x9E3779B9), seed ^ 0x5BF03635, index=sample, scramble=scramble
+            )
+            film = sensor.film()
+            corner = mi.Point2f(mi.Float(pixel % width) - border, mi.Float(pixel // width) - border)
+            pos = corner + mi.Point2f(film.crop_offset()) + sampler.stratified_2d(0)
+            pos_unit = (pos - mi.Point2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
+            aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+            time = sensor.shutter_open()
+            if sensor.shutter_open_time() > 0:
+                time += sampler.next_1d() * sensor.shutter_open_time()
+            ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), pos_unit, aperture)
+            ray.scale_differential(dr.rsqrt(mi.Float(spp)))
+
+            L, valid, extra = self.estimate(scene, field, sampler, ray, mixture, mi.Bool(True))
+            L *= weight
+            ok = dr.all(dr.isfinite(L))
+            L = dr.select(ok, L, 0)
+            values = [L.x, L.y, L.z]
+            if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+                values.append(dr.select(valid, mi.Float(1), 0))
+            values.append(dr.select(ok, mi.Float(1), 0))
+            for name in self.channels:
+                value = extra[name]
+                values += [value.x, value.y, value.z] if self.CHANNELS[name] == 3 else [mi.Float(value)]
+            dr.eval(values, ok)  # one kernel; the sums below would otherwise run the whole estimate again, each
+            n_bad = dr.count(~ok)
+            if box:  # one value a pixel, the sum of its samples
+                if spp > 1:
+                    values = [dr.block_sum(v, spp) for v in values]
+                first = dr.arange(mi.UInt32, width * n_rows) + first_row * width
+                pos = mi.Point2f(mi.Float(first % width) - border, mi.Float(first // width) - border)
+                pos += mi.Point2f(film.crop_offset()) + 0.5
+            dr.eval(pos, values, n_bad)
+            return pos, values, n_bad
+
+        return dr.freeze(render_pass, warn_after=50)
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """Radiance along given rays, for integrators that wrap this one (``aov``, ``moment``)."""
+        self._ready(scene, scene.sensors()[0], train=self.state.images == 0)
+        self.state.images = max(self.state.images, 1)
+        lane = mi.UInt32(sampler.next_1d() * 2**24)
+        own = PathSampler.make(lane, mi.UInt32(sampler.next_1d() * 2**24))
+        mixture = mi.Float(self.mixture(self.state.planned_spp or sampler.sample_count()))
+        L, valid, extra = self.estimate(scene, self.cache.field, own, ray, mixture, mi.Bool(active))
+        aovs = []
+        for name in self.channels:
+            aovs += list(extra[name]) if self.CHANNELS[name] == 3 else [extra[name]]
+        return L, valid, aovs
+
+    def aov_names(self):
+        return [f"{n}.{c}" if self.CHANNELS[n] == 3 else n for n in self.channels
+                for c in ("RGB" if self.CHANNELS[n] == 3 else " ")]  # fmt: skip

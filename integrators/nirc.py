@@ -1,0 +1,250 @@
+"""``nirc``: paths that end in a neural incident radiance cache."""
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.caches.incident import reflect
+from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.transport import termination, vertex
+
+TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
+#: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
+#: the cache's directional detail does not suffice for it.
+SHARP_PDF = 3.0
+#: Dimensions of the stratified numbers
+AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE = range(6)
+
+
+class NIRCIntegrator(CacheIntegrator):
+    def __init__(self, props):
+        super().__init__(props)
+        self.cache_samples = props.get("cache_samples", 8)
+        self.light_samples = props.get("light_samples", 2)
+        self.termination = props.get("termination", "adaptive")
+        self.spread_threshold = props.get("spread_threshold", 0.01)
+        self.gather_half = props.get("gather_half", 8.0)
+        self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
+        self._check(self.light_samples >= 1, f"light_samples is {self.light_samples}; it must be at least 1")
+        self._check(self.termination in TERMINATIONS,
+                    f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
+        self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
+        self._check(self.gather_half >= 0, f"gather_half is {self.gather_half}; it must be 0 or more")
+
+    @property
+    def needs_cache(self) -> bool:
+        return super().needs_cache and self.cache_samples > 0
+
+    @property
+    def queries_per_sample(self) -> float:
+        return 0.0 if not self.needs_cache else max(self.cache_samples, self.light_samples) + self.light_samples
+
+    def mixture(self, spp: int) -> float:
+        return {"primary": 0.0, "spread": 1.0, "balanced": 0.0}.get(
+            self.termination, spp / (spp + self.gather_half) if spp + self.gather_half > 0 else 1.0
+        )
+
+    # -------------------------------------------------------------------------------------------------------------
+
+    def estimate(self, scene, field, sampler, ray, mixture, active):
+        """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
+        L, β, ray, si, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
+        bsdf = si.bsdf(ray)
+        n_light = self.light_samples
+        cached = self.needs_cache and field is not None
+        features = field.encode(si.p) if cached else None
+        a_0 = termination.camera_spread(dr.squared_norm(si.p - ray.o), dr.dot(si.n, ray.d))
+
+        zero = mi.Color3f(0)
+        state = (mi.UInt32(0), mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero), sampler)
+
+        def traced_sample(i, direct, cache, residual, sampler):
+            # ---------------------- Direct light ----------------------
+            direct += vertex.direct_light(scene, si, bsdf, sampler.stratified_2d(NEE, n_light, i), active)
+
+            # ------------------- One BSDF sample ----------------------
+            bs, weight = bsdf.sample(
+                mi.BSDFContext(), si, sampler.stratified_1d(LOBE, n_light, i),
+                sampler.stratified_2d(BSDF, n_light, i), active,
+            )  # fmt: skip
+            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            weight = vertex.finite(weight, active)
+            wo = si.to_world(bs.wo)
+            next_ray = si.spawn_ray(wo)
+            alive = active & (dr.max(weight) > 0) & (self.max_depth != 1)
+
+            # ------------ What the cache says of its direction --------
+            Li_cache = mi.Color3f(0)
+            if cached:
+                Li_cache = dr.select(alive & ~delta, weight * field.query(features, wo), 0)
+                cache += Li_cache
+
+            # --------------- What is there: emission ------------------
+            si_next = scene.ray_intersect(next_ray, alive)
+            Le = vertex.emission_mis(scene, si_next, si.p, si.n, bs.pdf, delta, alive)
+            direct += weight * Le
+
+            # --------------- What is there: reflection ----------------
+            spread = dr.select(
+                delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
+            )
+            share = self.gather_share(delta, bs.pdf, spread, a_0, mixture) if cached else mi.Float(1)
+            follow = alive & (share > 0) & si_next.is_valid()
+            Li, sampler = self.gather(scene, field, sampler, next_ray, si_next, weight, bs, spread, a_0, follow)
+            residual += dr.select(alive, share * (Li - Li_cache), 0)
+            return i + 1, direct, cache, residual, sampler
+
+        _, direct, cache, residual, sampler = dr.while_loop(
+            state, lambda i, *_: active & (i < n_light), traced_sample, label="traced samples"
+        )
+
+        # ------------------- Cache samples without a ray --------------
+        if cached:
+            n_extra = max(self.cache_samples - n_light, 0)
+
+            def cache_sample(i, cache, sampler):
+                bs, weight = bsdf.sample(
+                    mi.BSDFContext(), si, sampler.stratified_1d(EXTRA_LOBE, n_extra, i),
+                    sampler.stratified_2d(EXTRA, n_extra, i), active,
+                )  # fmt: skip
+                rough = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                weight = vertex.finite(weight, rough)
+                return i + 1, cache + weight * field.query(features, si.to_world(bs.wo)), sampler
+
+            if n_extra:
+                _, cache, sampler = dr.while_loop(
+                    (mi.UInt32(0), cache, sampler), lambda i, *_: active & (i < n_extra), cache_sample,
+                    label="cache samples",
+                )  # fmt: skip
+            cache /= n_light + n_extra
+        direct, residual = direct / n_light, residual / n_light
+        L += dr.select(active, β * (direct + cache + residual), 0)
+        channels = {"direct": β * direct, "cache": β * cache, "residual": β * residual}
+        return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
+
+    def first_vertex(self, scene, sampler, ray, active):
+        """Follow the camera ray through delta surfaces to the first one with a smooth lobe.
+
+        Returns (emission on the way, throughput, last ray, its intersection, visible, active, sampler).
+        """
+        ctx = mi.BSDFContext()
+        ray = mi.RayDifferential3f(ray)
+        active = mi.Bool(active)
+        if self.hide:
+            ray.o = self.skip_area_emitters(scene, mi.Ray3f(ray), True, active).o
+        max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
+        active &= max_depth > 0
+
+        si = scene.ray_intersect(ray, active)
+        visible = active & si.is_valid()
+        shown = active & (si.is_valid() | (not self.hide))
+        L = vertex.emission(scene, si, shown)
+        visible |= shown & (dr.max(L) > 0)
+        β = dr.select(active & si.is_valid(), mi.Color3f(1), 0)
+
+        def is_delta(si, active):
+            return active & si.is_valid() & ~vertex.has_smooth(si.bsdf())
+
+        # Only a delta surface needs the loop: the others are done
+        chain = is_delta(si, active)
+
+        def bounce(depth, ray, β, L, chain, sampler):
+            si = scene.ray_intersect(ray, chain)
+            seen = chain & (depth > 0)
+            L += dr.select(seen, β * vertex.emission(scene, si, seen), 0)
+            goes_on = is_delta(si, chain)
+            bs, weight = si.bsdf().sample(ctx, si, sampler.next_1d(), sampler.next_2d(), goes_on)
+            β = dr.select(goes_on, β * weight, dr.select(chain & ~si.is_valid(), 0, β))
+            roulette = goes_on & (depth >= max(self.rr_depth, 8))
+            q = dr.minimum(dr.max(β), 0.95)
+            goes_on &= (dr.max(β) > 0) & (depth + 1 < max_depth) & (~roulette | (sampler.next_1d() < q))
+            β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
+            β = dr.select(is_delta(si, chain) & ~goes_on, 0, β)
+            ray = dr.select(goes_on, si.spawn_ray(si.to_world(bs.wo)), ray)
+            return depth + 1, ray, β, L, goes_on, sampler
+
+        depth, ray, β, L, _, sampler = dr.while_loop(
+            (mi.UInt32(0), mi.Ray3f(ray), β, L, mi.Bool(chain), sampler),
+            lambda depth, ray, β, L, chain, sampler: chain, bounce, label="delta chain",
+        )  # fmt: skip
+        si_chain = scene.ray_intersect(ray, chain & (dr.max(β) > 0))
+        si = dr.select(chain, si_chain, si)
+        active = (dr.max(β) > 0) & si.is_valid() & (depth + 1 < max_depth)
+        return L, β, ray, si, visible, active, sampler
+
+    def gather_share(self, delta, pdf, spread, a_0, mixture):
+        """How much of a direction's light is gathered at what it meets, instead of read from the cache here.
+
+        1 for delta and sharp lobes; 1 where the next surface is so near that the cache would blur what the pixel sees
+        (spread below its threshold), unless `termination` is ``primary``; elsewhere the share of the method.
+        """
+        needed = delta | (pdf > SHARP_PDF)
+        if self.termination != "primary":
+            needed |= ~termination.exceeds(spread, a_0, self.spread_threshold)
+        share = mixture
+        if self.termination == "balanced":
+            share = 1 - termination.balanced_probability(max(self.cache_samples, 1), pdf)
+        return dr.select(needed, 1, share)
+
+    def gather(self, scene, field, sampler, ray, si, β, bs, spread, a_0, active):
+        """Light that `si` reflects back along `ray`, times β: next-event estimation there, the rest from the cache at
+        the first vertex where the path is wide enough, by path tracing up to there."""
+        ctx = mi.BSDFContext()
+        cached = self.needs_cache and field is not None
+        max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
+        active = active & (max_depth > 2)
+
+        def one_vertex(depth, ray, si, β, η, L, spread, active, sampler):
+            bsdf = si.bsdf(ray)
+            smooth = active & vertex.has_smooth(bsdf)
+            wide = smooth & termination.exceeds(spread, a_0, self.spread_threshold) if cached else mi.Bool(False)
+
+            # Direct light; with a BSDF ray to share the work only where one will be followed
+            ds, w_emitter = scene.sample_emitter_direction(si, sampler.next_2d(), True, smooth)
+            f, pdf_bsdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth & (ds.pdf > 0))
+            w_mis = dr.select(ds.delta | (wide & (pdf_bsdf <= SHARP_PDF)), 1, vertex.mis_weight(ds.pdf, pdf_bsdf))
+            L += β * vertex.finite(f * w_emitter * w_mis, smooth & (ds.pdf > 0))
+
+            # One more direction: ask the cache for its light, or follow it
+            bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            wo = si.to_world(bs.wo)
+            β = vertex.finite(β * weight, active)
+            stop = wide & ~delta & (bs.pdf <= SHARP_PDF)
+            if cached:
+                L += dr.select(stop, β * field.query(field.encode(si.p), wo), 0)
+            η *= bs.eta
+            depth += 1
+            active &= ~stop & (dr.max(β) > 0) & (depth < max_depth)
+            roulette = depth >= self.rr_depth
+            q = dr.minimum(dr.max(β) * η**2, 0.95)
+            active &= ~roulette | (sampler.next_1d() < q)
+            β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
+
+            # Emission that the followed ray meets
+            next_ray = si.spawn_ray(wo)
+            si_next = scene.ray_intersect(next_ray, active)
+            L += β * vertex.emission_mis(scene, si_next, si.p, si.n, bs.pdf, delta, active)
+            active &= si_next.is_valid() & (depth + 1 < max_depth)
+            spread += dr.select(
+                delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
+            )
+            return depth, next_ray, si_next, β, η, L, spread, active, sampler
+
+        state = (mi.UInt32(2), mi.Ray3f(ray), si, mi.Color3f(β), mi.Float(bs.eta), mi.Color3f(0), mi.Float(spread),
+                 mi.Bool(active), sampler)  # fmt: skip
+        _, _, _, _, _, L, _, _, sampler = dr.while_loop(
+            state, lambda depth, ray, si, β, η, L, spread, active, sampler: active, one_vertex, label="gather"
+        )
+        return L, sampler
+
+    def to_string(self):
+        return (
+            f"NIRCIntegrator[\n  termination = {self.termination},\n  cache_samples = {self.cache_samples},\n"
+            f"  light_samples = {self.light_samples},\n  max_depth = {self.max_depth},\n"
+            f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
+            f"  frames trained = {self.cache.steps}\n]"
+        )
+
+
+NIRCIntegrator.CHANNELS = {"direct": 3, "cache": 3, "residual": 3}
+mi.register_integrator("nirc", lambda props: NIRCIntegrator(props))

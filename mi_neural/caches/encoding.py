@@ -1,0 +1,40 @@
+"""Inputs of the networks. Only what a cache needs: incident radiance depends on position and direction alone."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: The box is enlarged by this share on each axis (METHODS: 15 %), so that points a little outside stay inside.
+MARGIN = 0.15
+
+
+def to_unit_cube(p, box_min, box_inv_extent):
+    """Scene position to [0, 1]^3; what lies outside is moved to the surface of the cube."""
+    return mi.Point3f(dr.clip((p - box_min) * box_inv_extent, 0, 1))
+
+
+def direction(w, degree: int) -> list:
+    """Real spherical harmonics up to `degree` of unit vectors: ``(degree + 1)^2`` values."""
+    return dr.sh_eval(mi.Vector3f(w), degree)
+
+
+def record_box(points: np.ndarray, fallback_min, fallback_max, quantile: float = 0.002):
+    """The box in which records fall: where light is asked for, not where geometry is.
+
+    `points` has shape (n, 3). A scene's own box may be many times larger (lights and backdrops far away), and the grid
+    would spend its cells there. The outermost `quantile` on each side is left out. With no points: the fallback.
+    Returns (min, max) as float lists, enlarged by `MARGIN`, no axis thinner than 1/1000 of the longest.
+    """
+    points = points[np.isfinite(points).all(axis=-1)]
+    if len(points):
+        low, high = np.quantile(points, [quantile, 1 - quantile], axis=0)
+    else:
+        low, high = np.asarray(fallback_min, float), np.asarray(fallback_max, float)
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (high >= low).all()):
+        low, high = np.full(3, -1.0), np.full(3, 1.0)
+    longest = max(float((high - low).max()), 1e-6 * max(1.0, float(np.abs(low).max())))
+    extent = np.maximum((high - low) * (1 + MARGIN), 1e-3 * longest)
+    centre = (low + high) / 2
+    return (centre - extent / 2).tolist(), (centre + extent / 2).tolist()

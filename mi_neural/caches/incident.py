@@ -1,0 +1,302 @@
+"""NIRC: the neural incident radiance cache (Dereviannykh et al. 2025), and how it is trained.
+
+The cache learns ``L(x, ω)``: the radiance that arrives at x from ω after at least one reflection. What the next surface
+reflects is in it, next-event estimation there included; what the next surface emits is not: that is direct light at x,
+which the estimators trace. Nothing but position and direction enters the network, because incident radiance depends on
+nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.records import TrainingRecords, trace_training_paths
+from ..transport.samples import PathSampler
+from . import encoding, loss
+from .field import Field, FieldShape
+
+#: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
+TARGET_MAX = 1e4
+#: Targets are cut to this share of outliers when the scene's mean is measured.
+SCALE_TRIM = 1e-3
+
+
+@dataclass(frozen=True)
+class Training:
+    """Constants of one training step.
+
+    n_paths          training paths
+    n_vertices       vertices of a path; it ends in the cache itself (self-training). Long suffixes carry light through
+                     a closed room in a few frames and do not build on the cache's own errors; measured: README
+    n_tail           cache queries at the end of a path
+    n_local          queries that estimate the local mean of `loss.local_relative_l2`
+    epsilon          of that loss, over the squared mean target of the scene
+    learning_rate    of Adam, at the start; see `rate`
+    ema_decay        longest horizon of the averaged copy: 1 / (1 - ema_decay) steps
+    """
+
+    n_paths: int = 4096
+    n_vertices: int = 8
+    n_tail: int = 2
+    n_local: int = 2
+    epsilon: float = 0.03
+    learning_rate: float = 1e-2
+    ema_decay: float = 0.99
+
+    def __post_init__(self):
+        for name, least in (("n_paths", 1), ("n_vertices", 2), ("n_tail", 1), ("n_local", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate is {self.learning_rate}; it must be greater than 0")
+        if not 0 <= self.ema_decay <= 1:
+            raise ValueError(f"ema_decay is {self.ema_decay}; it must lie in [0, 1]")
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step: a hundred steps at full speed, then falling as 1/t to a tenth."""
+        return self.learning_rate * max(0.1, 1 / (1 + step / 100))
+
+    def decay(self, step: int) -> float:
+        """EMA decay of a step: the average spans the last seventh of the steps so far, at most the full horizon."""
+        return min(self.ema_decay, 1 - 1 / (0.15 * step + 1))
+
+
+def trace_records(scene, sensor, field: Field | None, training: Training, seed):
+    """Fresh training records, targets ending in the averaged cache (in nothing without a field)."""
+    lane = dr.arange(mi.UInt32, training.n_paths)
+    sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
+
+    def from_cache(si, bsdf, active, sampler):
+        return reflect(field, field.encode(si.p), si, bsdf, training.n_tail, sampler, active)
+
+    tail = from_cache if field is not None else (lambda si, bsdf, active, sampler: mi.Color3f(0))
+    return trace_training_paths(scene, sensor, sampler, training.n_paths, training.n_vertices, tail)
+
+
+def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
+    """``1/n sum_i L(x, ω_i) f cos / p(ω_i)``: what a surface reflects of the cache, by `n` BSDF samples.
+
+    Delta lobes are left out.
+    """
+    ctx = mi.BSDFContext()
+
+    def add(i, total, sampler):
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        rough = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        total += dr.select(rough, weight * field.query(features, si.to_world(bs.wo)), 0)
+        return i + 1, total, sampler
+
+    if n == 1:
+        return add(0, mi.Color3f(0), sampler)[1]
+    _, total, _ = dr.while_loop(
+        (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, total, sampler: active & (i < n), add, label="cache samples"
+    )
+    return total * (1 / n)
+
+
+def local_mean(field: Field, records: TrainingRecords, n: int, sampler):
+    """Mean prediction over the cosine-weighted hemisphere at each record, over `scale`, from `n` queries."""
+    features = field.encode(records.position)
+    frame = mi.Frame3f(mi.Normal3f(records.normal))
+
+    def add(i, total, sampler):
+        w = frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+        return i + 1, total + loss.luminance(dr.maximum(field.raw(features, w), 0)), sampler
+
+    _, total, _ = dr.while_loop(
+        (mi.UInt32(0), mi.Float(0), sampler), lambda i, total, sampler: i < n, add, label="local mean"
+    )
+    return total * (1 / n)
+
+
+def learn(field: Field, records: TrainingRecords, training: Training, seed, learning_rate, decay):
+    """One training step on the given records. Returns (loss, mean target over `scale`), both 1-wide."""
+    n_valid = dr.maximum(dr.count(records.valid), 1)
+    y = dr.select(records.valid, dr.clip(records.target / field.scale, 0, TARGET_MAX), 0)
+    with dr.suspend_grad():
+        mean_target = dr.sum(loss.luminance(y)) / n_valid
+        field.mean = dr.lerp(mean_target, field.mean, decay)
+        sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
+        mean_local = local_mean(field, records, training.n_local, sampler)
+        dr.eval(y, mean_local, field.mean)
+
+    p = field.predict(records.position, records.direction)
+    epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
+    error = loss.local_relative_l2(p, y, mean_local, epsilon)
+    total = dr.sum(dr.select(records.valid, error, 0)) / n_valid
+    field.step(total, learning_rate, decay)
+    return dr.detach(total), mean_target
+
+
+class IncidentCache:
+    """A field of incident radiance together with its training: start, train, watch, recover.
+
+    `statistics` counts since the start: records, steps, non-finite targets, recoveries, seconds of training.
+    """
+
+    #: A loss this many times the median of the last `WINDOW` is an explosion.
+    EXPLOSION = 1e3
+    WINDOW = 32
+    #: Steps between snapshots that a divergence is undone with.
+    SNAPSHOT_EVERY = 64
+
+    def __init__(self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0):
+        self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
+        self._frame = dr.freeze(self._frame_plain, warn_after=50)
+        self._probe = dr.freeze(lambda scene, sensor, seed: trace_records(scene, sensor, None, self.training, seed))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all that was learned. Compiled kernels are kept."""
+        self.field: Field | None = None
+        self.steps = 0
+        self.rate_factor = 1.0
+        self.losses: deque[float] = deque(maxlen=self.WINDOW)
+        self.history: list[float] = []
+        self._good: dict[str, np.ndarray] | None = None
+        self.statistics = {
+            "steps": 0, "records": 0, "nonfinite": 0, "recoveries": 0, "seconds_train": 0.0, "loss": math.nan,
+        }  # fmt: skip
+
+    # -------------------------------------------------------------------------------------------------------------
+
+    def _frame_plain(self, scene, sensor, field, seed, learning_rate, decay):
+        with dr.suspend_grad():
+            records, n_bad = trace_records(scene, sensor, field, self.training, seed)
+            dr.eval(records, n_bad)
+        total, mean_target = learn(field, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
+        return total, mean_target, dr.count(records.valid), n_bad
+
+    def start(self, scene, sensor) -> None:
+        """Measure where light is asked for and how bright it is, and make the field. One batch of paths, no training."""
+        with dr.suspend_grad():
+            records, _ = self._probe(scene, sensor, mi.UInt32(self._seed(0xFFFFFF)))
+            valid = np.array(records.valid)
+            points = np.array(records.position).T[valid]
+            target = np.array(records.target).T[valid].mean(axis=-1)
+        box = scene.bbox()
+        low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
+        scale = 0.0
+        if target.size:
+            scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
+        if not (math.isfinite(scale) and scale > 1e-30):
+            scale = 1.0  # no indirect light found: the cache will learn 0
+        self.field = Field(low, high, self.shape, scale=scale, seed=self.seed)
+        dr.eval(self.field)
+
+    def train_frame(self, scene, sensor) -> float:
+        """Trace fresh records and take one step on them; returns the loss. Divergence is undone, see `recover`."""
+        t0 = time.perf_counter()
+        if self.field is None:
+            self.start(scene, sensor)
+        if self._good is None:
+            self._good = self.field.snapshot()
+        training = self.training
+        rate = training.rate(self.steps) * self.rate_factor
+        outputs = self._frame(
+            scene, sensor, self.field, mi.UInt32(self._seed(self.steps)),
+            dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
+        )  # fmt: skip
+        value, _, n_valid, n_bad = (v[0] for v in outputs)
+        self.steps += 1
+        self.field.steps = self.steps
+        s = self.statistics
+        s["steps"], s["loss"] = self.steps, value
+        s["records"] += int(n_valid)
+        s["nonfinite"] += int(n_bad)
+        self._watch(value)
+        s["seconds_train"] += time.perf_counter() - t0
+        return value
+
+    def _seed(self, step: int) -> int:
+        return int(np.random.SeedSequence((self.seed, 0xCAC4E, step)).generate_state(1)[0])
+
+    def _watch(self, value: float) -> None:
+        """Divergence: a loss that is not finite, or far above what it has been."""
+        typical = float(np.median(self.losses)) if len(self.losses) >= 8 else math.inf
+        if not math.isfinite(value) or (typical > 0 and value > self.EXPLOSION * max(typical, 1e-6)):
+            self.recover()
+            return
+        self.losses.append(value)
+        self.history.append(value)
+        if self.steps % self.SNAPSHOT_EVERY == 0:
+            weights = self.field.snapshot()
+            if all(np.isfinite(w).all() for w in weights.values()):
+                self._good = weights
+
+    def recover(self) -> None:
+        """Go back to the last good weights, with half the learning rate."""
+        self.field.restore(self._good)
+        self.rate_factor *= 0.5
+        self.losses.clear()
+        self.statistics["recoveries"] += 1
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"mi_neural: training diverged at step {self.steps}; last good weights restored, learning rate halved",
+        )
+
+    def adopt(self, field: Field) -> None:
+        """Go on from a field that was trained before."""
+        self.field, self.steps, self._good = field, field.steps, None
+
+    def checkpoint(self):
+        """Everything that training changes, to go back to with :meth:`rollback`."""
+        return (
+            None if self.field is None else (self.field.snapshot(), self.field.mean),
+            self.steps, self.rate_factor, list(self.losses), list(self.history), self._good, dict(self.statistics),
+        )  # fmt: skip
+
+    def rollback(self, state) -> None:
+        """Undo training since `state` was taken; None: forget everything but the field's place and scale."""
+        if state is None:
+            field = self.field
+            self.reset()
+            field.reset()
+            self.field = field
+            return
+        weights, self.steps, self.rate_factor, losses, self.history, self._good, self.statistics = state
+        self.losses = deque(losses, maxlen=self.WINDOW)
+        if weights is not None:
+            self.field.restore(weights[0])
+            self.field.mean = weights[1]
+            self.field.steps = self.steps
+
+    def settled(self) -> bool:
+        """Whether the loss has stopped falling: its median over the last 64 steps is within 2 % of the 64 before."""
+        h = self.history
+        return len(h) >= 128 and np.median(h[-64:]) > 0.98 * np.median(h[-128:-64])
+
+    def train(
+        self, scene, sensor, frames: int | None = None, seconds: float | None = None,
+        at_least: int = 0, at_most: int = 1000, progress: Callable | None = None,
+    ) -> None:  # fmt: skip
+        """Train `frames` frames, or for about `seconds`, or (neither given) until `settled`.
+
+        `progress` is called with (done, total), in frames or seconds. The last two limits are for `settled`.
+        """
+        t0, done = time.perf_counter(), 0
+        while True:
+            elapsed = time.perf_counter() - t0
+            if frames is not None:
+                if done >= frames:
+                    break
+            elif seconds is not None:
+                if elapsed * (1 + 0.5 / max(done, 1)) >= seconds:
+                    break
+            elif done >= at_most or (done >= at_least and self.settled()):
+                break
+            self.train_frame(scene, sensor)
+            done += 1
+            if progress is not None:
+                if frames is None and seconds is not None:
+                    progress(min(time.perf_counter() - t0, seconds), seconds)
+                else:
+                    progress(done, frames if frames is not None else at_most)
