@@ -105,6 +105,7 @@ class _State:
     def __init__(self):
         self.passes: dict = {}
         self.planned_spp: int | None = None
+        self.ns_per_query = math.nan
         self.reset()
 
     def reset(self) -> None:
@@ -112,7 +113,6 @@ class _State:
         self.images = 0
         self.queries = 0.0
         self.nonfinite: list = []
-        self.ns_per_query = math.nan
 
 
 class CacheIntegrator(mi.SamplingIntegrator):
@@ -256,6 +256,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 dr.eval(self._render(scene, sensor, 1, spp))
         dr.sync_thread()
         if self.needs_cache:
+            if math.isnan(self.state.ns_per_query):
+                self.measure_query()
             self.cache.rollback(state)
         self.state.images, self.state.queries = images, queries
 
@@ -439,7 +441,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             dr.eval(pos, values, n_bad)
             return pos, values, n_bad
 
-        return dr.freeze(render_pass, warn_after=50)
+        return dr.freeze(render_pass, auto_opaque=False)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Radiance along given rays, for integrators that wrap this one (``aov``, ``moment``)."""

@@ -19,7 +19,7 @@ class NIRCIntegrator(CacheIntegrator):
     def __init__(self, props):
         super().__init__(props)
         self.cache_samples = props.get("cache_samples", 8)
-        self.light_samples = props.get("light_samples", 2)
+        self.light_samples = props.get("light_samples", 4)
         self.termination = props.get("termination", "adaptive")
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self.gather_half = props.get("gather_half", 8.0)
@@ -39,9 +39,11 @@ class NIRCIntegrator(CacheIntegrator):
         return 0.0 if not self.needs_cache else max(self.cache_samples, self.light_samples) + self.light_samples
 
     def mixture(self, spp: int) -> float:
-        return {"primary": 0.0, "spread": 1.0, "balanced": 0.0}.get(
-            self.termination, spp / (spp + self.gather_half) if spp + self.gather_half > 0 else 1.0
-        )
+        """Share of far light that is gathered: 0 for a single sample a pixel, 1/2 after `gather_half` more."""
+        if self.termination != "adaptive":
+            return {"primary": 0.0, "spread": 1.0, "balanced": 0.0}[self.termination]
+        more = max(spp - 1, 0)
+        return more / (more + self.gather_half) if more else 0.0
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -54,6 +56,8 @@ class NIRCIntegrator(CacheIntegrator):
         features = field.encode(si.p) if cached else None
         a_0 = termination.camera_spread(dr.squared_norm(si.p - ray.o), dr.dot(si.n, ray.d))
 
+        # Of the traced samples, so many gather what lies far: as few as the share allows, to save the rest their rays
+        n_gather = dr.clip(dr.ceil(mixture * n_light), 1, n_light)
         zero = mi.Color3f(0)
         state = (mi.UInt32(0), mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero), sampler)
 
@@ -87,7 +91,8 @@ class NIRCIntegrator(CacheIntegrator):
             spread = dr.select(
                 delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
             )
-            share = self.gather_share(delta, bs.pdf, spread, a_0, mixture) if cached else mi.Float(1)
+            far = dr.select(mi.Float(i) < n_gather, mixture * n_light / n_gather, 0)
+            share = self.gather_share(delta, bs.pdf, spread, a_0, far) if cached else mi.Float(1)
             follow = alive & (share > 0) & si_next.is_valid()
             Li, sampler = self.gather(scene, field, sampler, next_ray, si_next, weight, bs, spread, a_0, follow)
             residual += dr.select(alive, share * (Li - Li_cache), 0)
@@ -171,16 +176,16 @@ class NIRCIntegrator(CacheIntegrator):
         active = (dr.max(β) > 0) & si.is_valid() & (depth + 1 < max_depth)
         return L, β, ray, si, visible, active, sampler
 
-    def gather_share(self, delta, pdf, spread, a_0, mixture):
+    def gather_share(self, delta, pdf, spread, a_0, far):
         """How much of a direction's light is gathered at what it meets, instead of read from the cache here.
 
         1 for delta and sharp lobes; 1 where the next surface is so near that the cache would blur what the pixel sees
-        (spread below its threshold), unless `termination` is ``primary``; elsewhere the share of the method.
+        (spread below its threshold), unless `termination` is ``primary``; elsewhere `far`, or by ``balanced`` its own.
         """
         needed = delta | (pdf > SHARP_PDF)
         if self.termination != "primary":
             needed |= ~termination.exceeds(spread, a_0, self.spread_threshold)
-        share = mixture
+        share = far
         if self.termination == "balanced":
             share = 1 - termination.balanced_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)

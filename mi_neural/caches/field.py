@@ -62,6 +62,14 @@ class FieldShape:
         return self.n_levels * self.n_features + (self.direction_degree + 1) ** 2
 
 
+def _own(value):
+    """An evaluated, detached copy in memory of its own: not shared with another variable or with NumPy (such memory
+    must not be freed while a function is being frozen)."""
+    copy = dr.detach(value) + dr.opaque(mi.Float, 0)
+    dr.eval(copy)
+    return copy
+
+
 class _Weights:
     """One set of weights: a hash grid, an MLP as tensors, and the same MLP packed for queries.
 
@@ -120,11 +128,12 @@ class Field:
     Parameters: `box_min`, `box_max` (corners in world space), `shape`, `scale` (mean radiance of the scene, W/m²/sr or
     whatever the scene's unit is), `seed` (of the initial weights).
 
-    A PyTree: may be passed to frozen functions.
+    A PyTree: may be passed to frozen functions. The weights being trained are in it once, in the optimiser; `current`
+    is a view of them for queries, brought up to date by :meth:`sync`.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
-        "current": object, "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
+        "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
         "scale": object, "mean": object,
     }  # fmt: skip
 
@@ -140,13 +149,13 @@ class Field:
         self.box_min = mi.Point3f(box_min.tolist())
         self.box_inv_extent = mi.Vector3f((1 / (box_max - box_min)).tolist())
         self.scale = mi.Float(float(scale))
-        self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
         self.reset()
 
     def reset(self) -> None:
         """Start anew: the weights and the optimiser as they were when the field was made, bit for bit."""
         self.current = _Weights(self.shape, self.seed)
         self.averaged = _Weights(self.shape, self.seed)
+        self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
         self._attach_optimizer()
         self.steps = 0
         dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean)
@@ -155,7 +164,19 @@ class Field:
         # β_2 = 0.99: METHODS 1. The rate is given per step, see `step`.
         self.optimizer = Adam(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
         self.optimizer.update(self.current.parameters())
-        dr.eval(self.optimizer)
+        # A frozen step is recorded anew when inputs that shared a variable cease to: from the start, share none
+        for key, (value, promoted, lr, (t, *moments)) in self.optimizer.state.items():
+            value = _own(value)
+            dr.enable_grad(value)
+            self.optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
+        self.averaged.assign({k: _own(v) for k, v in self.averaged.parameters().items()})
+        self.averaged.pack()
+        dr.eval(self.optimizer, self.averaged)
+
+    def sync(self) -> None:
+        """Bring `current` up to date with training, for queries with ``averaged=False``."""
+        self.current.assign({k: dr.detach(v) for k, v in self.optimizer.items()})
+        self.current.pack()
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -202,15 +223,18 @@ class Field:
         # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
         self.optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in self.optimizer})
         self.optimizer.step(eval=False, active=ok)
-        new = {k: dr.detach(v) for k, v in self.optimizer.items()}
-        average = {k: dr.lerp(new[k], v, decay) for k, v in self.averaged.parameters().items()}
+        self.optimizer.set_learning_rate({k: None for k in self.optimizer})
+        decay = dr.select(ok, decay, 1)
+        average = {
+            k: dr.lerp(dr.detach(self.optimizer[k]), v, decay) for k, v in self.averaged.parameters().items()
+        }
         dr.eval(self.optimizer, average)
-        for weights, parameters in ((self.averaged, average), (self.current, new)):
-            weights.assign(parameters)
-            weights.pack()
+        self.averaged.assign(average)
+        self.averaged.pack()
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """All weights as NumPy arrays."""
+        self.sync()
         return {
             f"{name}.{k}": np.array(dr.detach(v))
             for name in ("current", "averaged")
@@ -221,7 +245,7 @@ class Field:
         """Weights from :meth:`snapshot` of a field of equal shape; the optimiser's moments start anew."""
         for name in ("current", "averaged"):
             weights = getattr(self, name)
-            weights.assign({k: type(v)(arrays[f"{name}.{k}"]) for k, v in weights.parameters().items()})
+            weights.assign({k: _own(type(v)(arrays[f"{name}.{k}"])) for k, v in weights.parameters().items()})
             weights.pack()
         self._attach_optimizer()
 
@@ -251,8 +275,9 @@ class Field:
         """
         path = Path(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {k: file[k] for k in file.files}
+            # Opened here: np.load() leaves a damaged file open
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as entries:
+                arrays = {k: entries[k] for k in entries.files}
             header = json.loads(bytes(arrays.pop("header")).decode())
             version = header["version"]
         except FileNotFoundError:
@@ -270,9 +295,11 @@ class Field:
                 raise ValueError("its arrays do not have the sizes that its header says")
             if not all(np.isfinite(v).all() for v in arrays.values()):
                 raise ValueError("it holds weights that are not finite")
+            mean, steps = header["mean"], header["steps"]
+            if not (isinstance(steps, int) and steps >= 0 and np.isfinite(mean) and mean >= 0):
+                raise ValueError(f"it says that {steps} steps were made, and a mean of {mean} found")
             field.restore(arrays)
-            field.mean = dr.opaque(mi.Float, header["mean"])
-            field.steps = header["steps"]
+            field.mean, field.steps = dr.opaque(mi.Float, mean), steps
         except Exception as e:
             raise CacheFileError(f"'{path}' is not a cache file of mi_neural, or is damaged ({e})") from None
         return field, header

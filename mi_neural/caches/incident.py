@@ -150,7 +150,7 @@ class IncidentCache:
 
     def __init__(self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0):
         self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
-        self._frame = dr.freeze(self._frame_plain, warn_after=50)
+        self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
         self._probe = dr.freeze(lambda scene, sensor, seed: trace_records(scene, sensor, None, self.training, seed))
         self.reset()
 

@@ -3,7 +3,7 @@
 Dr.Jit works asynchronously: the clock is read after ``dr.sync_thread()`` only. Kernels are compiled before it starts
 (:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; what an integrator
 with a cache can do beyond Mitsuba's own is looked up by name: `train`, `train_seconds`, `train_fraction`, `prepare`,
-`statistics`, `reset`.
+`plan_samples`, `statistics`, `reset`.
 
 Ctrl-C ends a rendering early and keeps what has been rendered; the result says so. During training it ends the
 training, and one pass is rendered with what has been learned.
@@ -177,12 +177,15 @@ def render_samples(
     """Render `spp` samples a pixel. The division into passes depends on film and `spp` alone, and so does the image."""
     run = _Run(scene, integrator, seed, sensor)
     try:
+        run.plan(spp)
         for n in plan_passes(scene, spp, sensor):
             run.one_pass(n)
             if progress:
                 progress(run.film.spp, spp)
     except KeyboardInterrupt:
         run.interrupted = True
+    finally:
+        run.plan(None)
     return run.result()
 
 
@@ -230,11 +233,16 @@ def render_seconds(
             if size is None and run.film.spp:
                 break
             size = size or sizes[0]
+            if times:  # samples that the finished image will have
+                known = max(times)
+                run.plan(run.film.spp + max(size, round((seconds - elapsed) / times[known] * known)))
             times[size] = run.one_pass(size)
     except KeyboardInterrupt:
         run.interrupted = True
         if run.film.spp == 0:
             run.one_pass(sizes[0])
+    finally:
+        run.plan(None)
     return run.result()
 
 
@@ -266,6 +274,11 @@ class _Run:
         self.n_passes = 0
         self.seconds_train = self.seconds_render = 0.0
         self.interrupted = False
+
+    def plan(self, spp: int | None) -> None:
+        """Tell an integrator that can use it (`plan_samples`) how many samples a pixel the image will have."""
+        if hasattr(self.integrator, "plan_samples"):
+            self.integrator.plan_samples(spp)
 
     def train_seconds(self, seconds: float) -> None:
         start = clock()

@@ -12,10 +12,9 @@ import mitsuba as mi
 def mis_weight(pdf_a, pdf_b):
     """Power heuristic with exponent 2 (Veach 1997, eq. 9.13); 0 where `pdf_a` is 0, so no 0/0 can arise.
 
-    Both densities are over solid angle.
+    Both densities are over solid angle. The ratio is squared, not they: a small or far light's exceeds 1e20.
     """
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.select(a > 0, a / (a + b), 0)
+    return dr.select(pdf_a > 0, 1 / (1 + dr.square(pdf_b / pdf_a)), 0)
 
 
 def finite(value, active):
@@ -65,3 +64,4 @@ def direct_light(scene, si, bsdf, sample, active, alone=False):
     f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
     w_mis = dr.select(ds.delta | alone, 1, mis_weight(ds.pdf, pdf_bsdf))
     return finite(f * weight * w_mis, active)
+
