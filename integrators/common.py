@@ -113,6 +113,8 @@ class _State:
         self.images = 0
         self.queries = 0.0
         self.nonfinite: list = []
+        self.facts: dict = {}  # what was measured of the scene
+        self.image_open = False
 
 
 class CacheIntegrator(mi.SamplingIntegrator):
@@ -174,6 +176,9 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Radiance along camera rays: (L, valid, {channel: value})."""
         raise NotImplementedError
 
+    def settle(self, scene, sensor) -> None:
+        """Measure, once per scene, what settings depend on; results go to ``state.facts``."""
+
     @property
     def needs_cache(self) -> bool:
         """Whether the settings can lead to a query at all."""
@@ -204,11 +209,16 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 self.reset()
             self.state.scene_key, self.state.signature = key, scene_signature(scene)
         if not self.needs_cache:
+            if not self.state.facts:
+                self.settle(scene, sensor)
             return
         with dr.resume_grad():
             if self.cache.field is None:
                 self.cache.start(scene, sensor)
-            if train and not self.freeze_cache:
+            if not self.state.facts:
+                with dr.suspend_grad():
+                    self.settle(scene, sensor)
+            if train and not self.freeze_cache and not self.state.image_open:
                 if self.state.images == 0 and self.cache.steps == 0:
                     auto = self.train_frames < 0
                     self.cache.train(scene, sensor, frames=None if auto else self.train_frames,
@@ -238,6 +248,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
 
     def plan_samples(self, spp: int | None) -> None:
         """Say how many samples a pixel the finished image will have, when it is rendered in several calls."""
+        if spp is None:
+            self.state.image_open = False
         self.state.planned_spp = spp
 
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
@@ -267,6 +279,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         s["nonfinite"] += sum(int(n[0]) for n in self.state.nonfinite)
         s["queries"] = int(self.state.queries)
         s["images"] = self.state.images
+        s.update(self.state.facts)
         if self.cache.field is not None:
             s["parameters"] = sum(int(np.prod(v.shape)) for v in self.cache.field.averaged.parameters().values())
             s["scale"] = float(self.cache.field.scale[0])
@@ -354,6 +367,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             film.prepare(self.aov_names())
             film.put_block(block)
             self.state.images += 1
+            self.state.image_open = self.state.planned_spp is not None
             result = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(result)

@@ -2,10 +2,11 @@
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mi_neural.caches.incident import reflect
 from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
 from mi_neural.transport import termination, vertex
+from mi_neural.transport.samples import PathSampler
 
 TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
 #: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
@@ -18,13 +19,14 @@ AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE = range(6)
 class NIRCIntegrator(CacheIntegrator):
     def __init__(self, props):
         super().__init__(props)
-        self.cache_samples = props.get("cache_samples", 8)
-        self.light_samples = props.get("light_samples", 4)
+        self.cache_samples = props.get("cache_samples", 4)
+        self.light_samples = props.get("light_samples", -1)
         self.termination = props.get("termination", "adaptive")
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self.gather_half = props.get("gather_half", 8.0)
         self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
-        self._check(self.light_samples >= 1, f"light_samples is {self.light_samples}; it must be at least 1")
+        self._check(self.light_samples == -1 or self.light_samples >= 1,
+                    f"light_samples is {self.light_samples}; give -1 (by the noise of direct light), 1 or more")  # fmt: skip
         self._check(self.termination in TERMINATIONS,
                     f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
@@ -36,7 +38,42 @@ class NIRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
-        return 0.0 if not self.needs_cache else max(self.cache_samples, self.light_samples) + self.light_samples
+        return 0.0 if not self.needs_cache else max(self.cache_samples, self.n_light)
+
+    @property
+    def n_light(self) -> int:
+        """Emitter and traced BSDF samples per camera sample: as set, or as :meth:`settle` found."""
+        return self.light_samples if self.light_samples > 0 else self.state.facts.get("light_samples", 1)
+
+    def settle(self, scene, sensor) -> None:
+        """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene."""
+        if self.light_samples > 0:
+            return
+        n = 2**14
+        lane = dr.arange(mi.UInt32, n)
+        sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
+        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(AA), mi.Point2f(0.5))
+        L, β, ray, si, _, active, sampler = self.first_vertex(scene, sampler, ray, mi.Bool(True))
+        bsdf = si.bsdf(ray)
+
+        def once(k, mean, square, sampler):
+            bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+            next_ray = si.spawn_ray(si.to_world(bs.wo))
+            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            Le = vertex.emission_mis(scene, scene.ray_intersect(next_ray, active), si.p, si.n, bs.pdf, delta, active)
+            direct = vertex.direct_light(scene, si, bsdf, sampler.next_2d(), active)
+            direct = dr.mean(vertex.finite(β * (direct + vertex.finite(weight * Le, active)), active))
+            return k + 1, mean + 0.25 * direct, square + 0.25 * dr.square(direct), sampler
+
+        _, mean, square, sampler = dr.while_loop(
+            (mi.UInt32(0), mi.Float(0), mi.Float(0), sampler), lambda k, *_: k < 4, once
+        )
+        variance = np.array(dr.maximum(square - dr.square(mean), 0)) * (4 / 3)
+        # Relative to the brightness of the place, the scene's mean being its floor
+        level = float(np.mean(np.array(mean + dr.mean(L)))) + (float(self.cache.field.scale[0]) if self.cache.field else 0)
+        noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
+        self.state.facts["direct_noise"] = float(noise)
+        self.state.facts["light_samples"] = 1 if noise < 0.02 else 2 if noise < 0.08 else 4
 
     def mixture(self, spp: int) -> float:
         """Share of far light that is gathered: 0 for a single sample a pixel, 1/2 after `gather_half` more."""
@@ -51,7 +88,7 @@ class NIRCIntegrator(CacheIntegrator):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
         L, β, ray, si, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
         bsdf = si.bsdf(ray)
-        n_light = self.light_samples
+        n_light = self.n_light
         cached = self.needs_cache and field is not None
         features = field.encode(si.p) if cached else None
         a_0 = termination.camera_spread(dr.squared_norm(si.p - ray.o), dr.dot(si.n, ray.d))
@@ -245,11 +282,84 @@ class NIRCIntegrator(CacheIntegrator):
     def to_string(self):
         return (
             f"NIRCIntegrator[\n  termination = {self.termination},\n  cache_samples = {self.cache_samples},\n"
-            f"  light_samples = {self.light_samples},\n  max_depth = {self.max_depth},\n"
+            f"  light_samples = {self.n_light}{' (chosen)' if self.light_samples < 0 else ''},\n  max_depth = {self.max_depth},\n"
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
             f"  frames trained = {self.cache.steps}\n]"
         )
 
 
 NIRCIntegrator.CHANNELS = {"direct": 3, "cache": 3, "residual": 3}
+NIRCIntegrator.__doc__ = (
+    r"""
+    .. _integrator-nirc:
+
+    Neural incident radiance cache (:monosp:`nirc`)
+    -----------------------------------------------
+
+    Estimates all light with little noise and a small bias: at the first surface that is not a mirror, direct light is
+    traced as in ``path`` (next-event estimation and BSDF rays, weighted against each other; environment included), and
+    light that was reflected before is read from a network trained while rendering, which knows the incident radiance
+    :math:`L(x, \omega)` (Dereviannykh et al. 2025, "Neural Two-Level Monte Carlo Real-Time Rendering", eq. for the
+    cache-based estimator):
+
+    .. math:: L_o = L_e + L_{direct} + \frac{1}{N_c} \sum_i \frac{L_{cache}(x, \omega_i) f \cos\theta_i}{p(\omega_i)}
+              + \frac{1}{N_l} \sum_j u_j \frac{(L_{gather} - L_{cache})(x, \omega_j) f \cos\theta_j}{p(\omega_j)}.
+
+    The last sum runs over the directions that were traced for direct light anyway. It replaces the cache's answer by
+    what is gathered one vertex later (next-event estimation there, the rest from the cache there), with a share
+    :math:`u` that is 1 for mirrors, sharp lobes and surfaces so near that the cache would blur what the pixel sees, and
+    elsewhere depends on ``termination``. :math:`E[L_o]` is the path-traced radiance if the cache is exact.
+
+    What the cache holds: light reflected at least once, next-event estimation included. What it does not hold: emission.
+
+    .. pluginparameters::
+
+     * - termination
+       - |string|
+       - Share of far light that is gathered. ``primary``: none, least noise, most bias. ``spread``: all, the path goes
+         on until its spread exceeds that of the pixel (Müller et al. 2021, sec. 3.4). ``balanced``: 1 - t with
+         t = Nc p_f / (Nc p_f + p_g) (Dereviannykh et al.). ``adaptive``: none for one sample a pixel, growing with the
+         image's sample count, as noise gives way to bias. (Default: adaptive)
+     * - cache_samples
+       - |int|
+       - Directions :math:`N_c` in which the cache is asked per camera sample. 0: no cache, ``nirc`` is a path tracer.
+         (Default: 4)
+     * - light_samples
+       - |int|
+       - Emitter samples, and traced BSDF samples :math:`N_l`, at the first vertex per camera sample. -1: 1, 2 or 4, by
+         the noise of direct light, which is measured once per scene. (Default: -1)
+     * - spread_threshold
+       - |float|
+       - Constant c of the spread test a > c a_0; 0: no surface is too near. (Default: 0.01)
+     * - gather_half
+       - |float|
+       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 8)
+    """
+    + SHARED_KEYS.strip("\n")
+    + r"""
+
+    Channels: ``direct``, ``cache``, ``residual`` (RGB each); with visible emission they sum to the image.
+
+    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
+    participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside
+    the cache (use ``path``). Thin walls between bright and dark places leak at one sample a pixel (use ``spread``).
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    :class:`~mi_neural.caches.field.CacheFileError` for cache files.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nirc">
+                <integer name="cache_samples" value="8"/>
+                <string name="termination" value="adaptive"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            integrator = mi.load_dict({"type": "nirc", "cache_samples": 8})
+            integrator.train(scene, 300)               # optional: the first image trains by itself
+            image = mi.render(scene, integrator=integrator, spp=16)
+    """
+)
 mi.register_integrator("nirc", lambda props: NIRCIntegrator(props))

@@ -250,7 +250,7 @@ class IncidentCache:
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field.snapshot(), self.field.mean),
+            None if self.field is None else (self.field.snapshot(), mi.Float(self.field.mean)),
             self.steps, self.rate_factor, list(self.losses), list(self.history), self._good, dict(self.statistics),
         )  # fmt: skip
 

@@ -1,0 +1,571 @@
+"""``nirc``: known answers, limit cases, emission counted once, state from image to image, films, refusals.
+
+Every pixel of the two scenes of known answer has the radiance 1, so biases show as they are. The z-tests compare with
+Mitsuba's `path` and fail a correct integrator in one of 10,000 choices of seed; each prints what it could have seen.
+"""
+
+import gc
+import importlib
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from expectation import assert_same_mean, renders
+from test_incident import load
+from test_vertex import LIGHTS, lights, test_scene
+
+from mi_neural.caches.field import CacheFileError
+
+TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
+#: A cache that is trained in a second.
+SMALL = {"type": "nirc", "train_samples": 512, "train_frames": 60, "train_steps": 0}
+
+
+def nirc(**keys):
+    return mi.load_dict({**SMALL, **keys})
+
+
+def render(scene, integrator, spp=16, seed=0, **kw) -> np.ndarray:
+    image = np.array(integrator.render(scene, spp=spp, seed=seed, **kw), dtype=np.float64)
+    assert np.isfinite(image).all()
+    return image
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return load("lit_cube", 16)[0]
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return load("point_lit_sphere", 16)[0]
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Area light, environment, point light; diffuse, rough metal, plastic, glass."""
+    return test_scene(lights("all"))
+
+
+@pytest.fixture(scope="module")
+def trained(sphere):
+    """An integrator trained in the sphere, extra channels on. Leave its keys alone."""
+    integrator = nirc(channels="direct, cache, residual")
+    integrator.train(sphere, 60)
+    return integrator
+
+
+# ---------------------------------------------------------------- analytic
+
+
+@pytest.mark.parametrize("name", ["lit_cube", "point_lit_sphere"])
+@pytest.mark.parametrize("termination", TERMINATIONS)
+def test_known_answer_within_two_percent_by_every_termination(name, termination):
+    """Emission lost or counted twice at any vertex is off by an eighth or more."""
+    scene, _ = load(name)
+    integrator = nirc(termination=termination, train_samples=1024)
+    image = render(scene, integrator, 64)
+    print(f"{name}, {termination}: mean {image.mean():.4f} (known 1), after {integrator.cache.steps} training frames")
+    assert integrator.cache.steps == 60
+    assert abs(image.mean() - 1) < 0.02
+    parts = image.mean(axis=-1).reshape(4, 4, 4, 4).mean(axis=(1, 3))
+    assert np.abs(parts - 1).max() < 0.06
+
+
+@pytest.mark.parametrize("termination", TERMINATIONS)
+def test_right_cache_gives_the_right_image_by_every_termination(sphere, termination):
+    """A cache that answers 1, which is exact in the sphere: no bias is left. Error rate 1e-4 per pixel and channel."""
+    integrator = nirc(termination=termination, freeze_cache=True)
+    render(sphere, integrator, 1)
+    field = integrator.cache.field
+    field.restore({k: np.zeros_like(v) for k, v in field.snapshot().items()})
+    dr.make_opaque(field.scale)
+    field.scale = dr.opaque(mi.Float, 1.0)
+    images = np.stack([render(sphere, integrator, 16, k) for k in range(8)])
+    error = images.mean() - 1
+    bound = 4 * images.mean(axis=(1, 2, 3)).std(ddof=1) / math.sqrt(8) + 1e-5
+    print(f"{termination}: off by {error:.1e}; smallest visible bias {bound:.1e}")
+    assert abs(error) <= bound
+
+
+@pytest.mark.parametrize("depth, known", [(0, 0), (1, 0.5), (2, 0.75), (3, 0.875), (4, 0.9375), (-1, 1)])
+def test_without_cache_the_lit_cube_has_the_radiance_of_its_depth(cube, depth, known):
+    image = render(cube, nirc(cache_samples=0, max_depth=depth), 256)
+    print(f"depth {depth}: {image.mean():.5f}, known {known}")
+    assert image.mean() == pytest.approx(known, rel=5e-3)
+
+
+@pytest.mark.parametrize("light", [2.0**-20, 2.0**20])
+def test_image_scales_with_the_light(light):
+    images = []
+    for factor in (1.0, light):
+        scene, _ = load(light=0.5 * factor)
+        images.append(render(scene, nirc(train_frames=20), 4) / factor)
+    difference = np.sqrt(np.mean((images[0] - images[1]) ** 2)) / images[0].mean()
+    print(f"light {light:g}: rms difference {difference:.1e}")
+    assert difference < 0.01
+
+
+def test_scene_whose_lights_are_off_is_black():
+    scene, _ = load(light=0)
+    image = render(scene, nirc(train_frames=128, train_samples=1024), 4)
+    print(f"mean {image.mean():.1e}")
+    assert image.mean() < 1e-3
+
+
+# ---------------------------------------------------------------- limit cases
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3, 5, -1])
+def test_without_cache_it_is_path(mixed, depth):
+    """cache_samples = 0: glass sphere, rough and smooth lobes, all lights."""
+    ours = renders(mixed, {"type": "nirc", "cache_samples": 0, "max_depth": depth}, 24, 32)
+    path = renders(mixed, {"type": "path", "max_depth": depth}, 24, 64, first_seed=1000)
+    assert_same_mean(ours, path, f"depth {depth}", relative=1e-5)
+
+
+@pytest.mark.parametrize("hide", [False, True])
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_up_to_depth_two_it_is_path(mixed, depth, hide):
+    """With its cache: none is asked, and none is trained."""
+    integrator = nirc(max_depth=depth, hide_emitters=hide)
+    ours = renders(mixed, integrator, 24, 32)
+    path = renders(mixed, {"type": "path", "max_depth": depth, "hide_emitters": hide}, 24, 64, first_seed=1000)
+    assert_same_mean(ours, path, f"depth {depth}, hide {hide}", relative=1e-5)
+    assert integrator.cache.steps == 0 and integrator.statistics()["queries"] == 0
+
+
+def test_hidden_emitters_still_light_the_scene(mixed):
+    """hide_emitters without depth limit and cache: as path does it."""
+    keys = {"hide_emitters": True, "max_depth": 8}
+    ours = renders(mixed, {"type": "nirc", "cache_samples": 0, **keys, "max_depth": -1}, 24, 32)
+    path = renders(mixed, {"type": "path", **keys, "max_depth": -1}, 24, 64, first_seed=1000)
+    assert_same_mean(ours, path, "hidden", relative=1e-5)
+
+
+def test_share_of_gathered_light_follows_termination_and_samples():
+    assert [nirc(termination=t).mixture(16) for t in ("primary", "spread", "balanced")] == [0, 1, 0]
+    shares = [nirc(termination="adaptive", gather_half=8.0).mixture(n) for n in (1, 2, 9, 1000, 10**6)]
+    assert shares == sorted(shares) and 0 <= shares[0] < 0.2 and shares[-1] > 0.99
+    for n in (1, 2, 16):
+        assert 0 <= nirc(gather_half=0.0).mixture(n) <= 1
+
+
+# ---------------------------------------------------------------- emission once; delta chains
+
+
+@pytest.mark.parametrize("name", ["envmap", "constant", "directional", "all"])
+def test_trained_image_is_that_of_path_under_every_light(name):
+    """Mean within 3 %, 16 blocks within 12 %, the camera looking through glass among other things."""
+    scene = test_scene(lights(name))
+    image = render(scene, nirc(train_samples=1024), 256)
+    path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
+    blocks = [i.reshape(4, 4, 4, 4, 3).mean(axis=(1, 3, 4)) for i in (image, path)]
+    error = np.abs(blocks[0] / blocks[1] - 1)
+    print(f"{name}: mean off by {image.mean() / path.mean() - 1:+.4f}, blocks by up to {error.max():.3f}")
+    assert abs(image.mean() / path.mean() - 1) < 0.03 and error.max() < 0.12
+
+
+def room(size=16) -> mi.Scene:
+    """A closed box of albedo 1/2, lit from a panel, with a glass and a mirror ball and a mirror wall."""
+    T = mi.ScalarTransform4f
+    grey = {"type": "diffuse", "reflectance": 0.5}
+    walls = {
+        f"wall{k}": {"type": "rectangle", "bsdf": {"type": "conductor"} if k == 2 else grey, "to_world": t.scale(2)}
+        for k, t in enumerate((
+            T().translate([0, -2, 0]).rotate([1, 0, 0], -90), T().translate([0, 2, 0]).rotate([1, 0, 0], 90),
+            T().translate([-2, 0, 0]).rotate([0, 1, 0], 90), T().translate([2, 0, 0]).rotate([0, 1, 0], -90),
+            T().translate([0, 0, -2]), T().translate([0, 0, 2]).rotate([1, 0, 0], 180),
+        ))
+    }  # fmt: skip
+    return mi.load_dict({
+        "type": "scene", **walls,
+        "lamp": {"type": "rectangle", "to_world": T().translate([0, 1.9, 0]).rotate([1, 0, 0], 90).scale(0.7),
+                 "emitter": {"type": "area", "radiance": 4.0}},
+        "glass": {"type": "sphere", "center": [-0.7, -1.2, 0.3], "radius": 0.7, "bsdf": {"type": "dielectric"}},
+        "ball": {"type": "sphere", "center": [0.9, -1.2, -0.5], "radius": 0.7, "bsdf": {"type": "conductor"}},
+        "sensor": {"type": "perspective", "fov": 75, "to_world": T().look_at([0, 0, 1.9], [0, -0.3, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("termination", ["adaptive", "primary"])
+def test_glass_and_mirrors_show_what_path_shows(termination):
+    scene = room()
+    image = render(scene, nirc(train_samples=1024, termination=termination), 128)
+    path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=2048), dtype=np.float64)
+    blocks = [i.reshape(4, 4, 4, 4, 3).mean(axis=(1, 3, 4)) for i in (image, path)]
+    error = np.abs(blocks[0] / blocks[1] - 1)
+    print(f"mean off by {image.mean() / path.mean() - 1:+.4f}, blocks by up to {error.max():.3f}")
+    assert abs(image.mean() / path.mean() - 1) < 0.05 and error.max() < 0.25
+
+
+def test_room_of_mirrors_without_a_smooth_surface_renders():
+    """All-delta materials: there are no records, the light is what chains of reflections show."""
+    scene = mi.load_dict({
+        "type": "scene", "sky": {"type": "constant", "radiance": 0.5},
+        "ball": {"type": "sphere", "bsdf": {"type": "dielectric"}},
+        "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}},
+    })  # fmt: skip
+    image = render(scene, nirc(train_frames=3), 64)  # a glass ball under a constant sky cannot be seen
+    np.testing.assert_allclose(image[..., :3], 0.5, rtol=1e-3)
+
+
+def test_emission_that_is_not_finite_is_counted_and_stays_out_of_the_image():
+    scene, _ = load()
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("emitter.radiance.value"))  # noqa: SIM118
+    params[key] = mi.Color3f(float("nan"), 0.5, 0.5)
+    params.update()
+    integrator = nirc(train_frames=5)
+    image = render(scene, integrator, 8)
+    assert integrator.statistics()["nonfinite"] > 0 and image.mean() > 0.3
+
+
+# ---------------------------------------------------------------- channels
+
+
+def test_channels_sum_to_the_image(sphere, trained):
+    image = render(sphere, trained)
+    assert image.shape == (16, 16, 12) and trained.aov_names() == [
+        f"{n}.{c}" for n in ("direct", "cache", "residual") for c in "RGB"
+    ]
+    colour, direct, cache, residual = np.split(image, 4, axis=-1)
+    np.testing.assert_allclose(direct + cache + residual, colour, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(direct, 0.5, rtol=1e-3)  # direct light of the point is exactly half of all
+    assert cache.mean() == pytest.approx(0.5, rel=0.05)
+
+
+def test_channels_have_the_order_of_the_key(sphere, trained):
+    integrator = nirc(channels="cache,direct", train_frames=1)
+    image = render(sphere, integrator, 4)
+    assert image.shape[-1] == 9
+    np.testing.assert_allclose(image[..., 6:9], 0.5, rtol=1e-3)
+
+
+# ---------------------------------------------------------------- state
+
+
+def test_state_lives_from_image_to_image(sphere):
+    integrator = nirc(train_frames=10, train_steps=2)
+    for k in range(4):
+        render(sphere, integrator, 1, k)
+        assert integrator.cache.steps == 10 + 2 * k and integrator.state.images == k + 1
+    s = integrator.statistics()
+    assert s["images"] == 4 and s["queries"] > 0 and s["steps"] == 16 and s["nonfinite"] == 0
+    integrator.reset()
+    assert integrator.cache.steps == 0 and integrator.statistics()["queries"] == 0
+    render(sphere, integrator, 1)
+    assert integrator.cache.steps == 10
+
+
+def test_frozen_cache_is_not_trained(sphere):
+    integrator = nirc(freeze_cache=True)
+    render(sphere, integrator, 1)
+    integrator.train(sphere, 5)
+    integrator.train_seconds(sphere, 0.1)
+    assert integrator.cache.steps == 0 and integrator.train_fraction(10) == 0
+
+
+def test_another_scene_starts_anew_and_going_back_too(sphere, cube):
+    integrator = nirc(train_frames=4, train_steps=1)
+    render(sphere, integrator, 1)
+    render(sphere, integrator, 1)
+    for scene in (cube, sphere):
+        render(scene, integrator, 1)
+        assert integrator.cache.steps == 4 and integrator.state.images == 1
+
+
+def test_another_scene_is_noticed_when_the_first_has_been_deleted():
+    """Its successor may lie at the same address."""
+    integrator = nirc(train_frames=4, train_steps=1)
+    for light in (0.5, 5.0, 50.0):
+        scene, _ = load(light=light, size=8)
+        render(scene, integrator, 1)
+        assert integrator.cache.steps == 4, "the new scene was taken for the old one"
+        assert integrator.cache.field.scale[0] == pytest.approx(0.8 * light, rel=0.3)
+        del scene, _
+        gc.collect()
+
+
+def test_cache_adapts_when_a_parameter_of_the_scene_changes():
+    scene, _ = load("point_lit_sphere", 8)
+    integrator = nirc(train_frames=40, train_steps=1)
+    assert render(scene, integrator).mean() == pytest.approx(1, rel=0.1)
+    params = mi.traverse(scene)
+    params["light.intensity.value"] = 4 * params["light.intensity.value"]
+    params.update()
+    means = [render(scene, integrator, 4, k).mean() for k in range(60)]
+    print(f"after the light was made 4 times brighter: {means[0]:.2f}, {means[10]:.2f}, {means[-1]:.2f}")
+    assert integrator.cache.steps == 100  # the same scene
+    assert means[-1] == pytest.approx(4, rel=0.1)
+
+
+def test_preparing_changes_nothing_but_the_time():
+    (a, _), (b, _) = load("lit_cube", 8), load("lit_cube", 8)
+    prepared, plain = nirc(train_frames=5), nirc(train_frames=5)
+    prepared.prepare(a, spp=4)
+    assert prepared.cache.steps == 0 and prepared.state.images == 0 and prepared.statistics()["records"] == 0
+    np.testing.assert_allclose(render(a, prepared, 4), render(b, plain, 4), rtol=0.02)
+    before = prepared.statistics()
+    weights = prepared.cache.field.snapshot()
+    prepared.prepare(a, spp=4)
+    after = prepared.cache.field.snapshot()
+    assert all(np.array_equal(weights[k], after[k]) for k in weights)
+    assert {k: v for k, v in prepared.statistics().items() if k != "ns_per_query"} == {
+        k: v for k, v in before.items() if k != "ns_per_query"
+    }
+
+
+def test_training_by_hand_reports_progress_and_statistics(sphere):
+    integrator, calls = nirc(), []
+    s = integrator.train(sphere, 3, progress=lambda *a: calls.append(a))
+    assert calls[-1] == (3, 3) and s["steps"] == 3 and s["records"] == 3 * 512 * 7
+    s = integrator.train_seconds(sphere, 0.2)
+    assert s["steps"] > 3 and s["seconds_train"] < 2
+    render(sphere, integrator, 1)  # trained already: the first image adds train_steps, not train_frames
+    assert integrator.cache.steps == s["steps"]
+
+
+def test_training_until_settled_ends(sphere):
+    common = importlib.import_module("mi_neural.integrators.common")
+    integrator = nirc(train_frames=-1, train_samples=256)
+    render(sphere, integrator, 1)
+    assert common.SETTLE_FRAMES[0] <= integrator.cache.steps <= common.SETTLE_FRAMES[1]
+
+
+def test_equal_seeds_give_equal_images(sphere, trained):
+    a, b, c = (render(sphere, trained, 4, seed) for seed in (5, 5, 6))
+    assert np.array_equal(a, b) and not np.array_equal(a, c)
+    first, second = (render(sphere, nirc(train_frames=10), 4, 5) for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-2)  # up to the order in which threads sum up gradients
+
+
+def test_key_seed_changes_the_cache_and_nothing_else(sphere):
+    a, b = (nirc(train_frames=3, seed=s) for s in (1, 2))
+    x, y = render(sphere, a, 4), render(sphere, b, 4)
+    assert not np.array_equal(x, y)
+    assert a.cache.field.seed == 1 and b.cache.field.seed == 2
+
+
+def test_saved_cache_gives_the_same_image(sphere, cube, trained, tmp_path):
+    image = render(sphere, trained, 4, 3)
+    trained.save_cache(tmp_path / "c")
+    other = nirc(channels="direct, cache, residual")
+    other.load_cache(tmp_path / "c", sphere)
+    assert other.cache.steps == trained.cache.steps
+    np.testing.assert_array_equal(render(sphere, other, 4, 3), image)
+    with pytest.raises(CacheFileError, match="another scene"):
+        nirc().load_cache(tmp_path / "c", cube)
+    late = nirc(train_frames=1)
+    render(cube, late, 1)
+    with pytest.raises(CacheFileError, match="another scene"):
+        late.load_cache(tmp_path / "c")
+    with pytest.raises(CacheFileError, match="same sizes"):
+        nirc(width=16).load_cache(tmp_path / "c")
+    with pytest.raises(CacheFileError, match="no cache file"):
+        nirc().load_cache(tmp_path / "nothing")
+    with pytest.raises(RuntimeError, match="no cache to save"):
+        nirc().save_cache(tmp_path / "d")
+    with pytest.raises(RuntimeError, match="no cache yet"):
+        nirc().measure_query()
+    assert not (tmp_path / "d").exists()
+
+
+def test_loaded_cache_is_refused_in_another_scene_when_it_is_rendered(sphere, cube, trained, tmp_path):
+    """Loaded without a scene, the cache meets it at the first image: it is used for its own, not for another."""
+    trained.save_cache(tmp_path / "c")
+    own = nirc()
+    own.load_cache(tmp_path / "c")
+    render(sphere, own, 1)
+    assert own.cache.steps == trained.cache.steps
+    other = nirc(train_frames=2)
+    other.load_cache(tmp_path / "c")
+    with pytest.raises(CacheFileError, match="another scene"):
+        render(cube, other, 1)
+
+
+# ---------------------------------------------------------------- ways to call it
+
+
+def test_xml_dictionary_and_render_calls_agree(sphere):
+    xml = '<integrator type="nirc" version="3.0.0"><integer name="train_frames" value="10"/>\
+        <integer name="train_samples" value="512"/><integer name="train_steps" value="0"/></integrator>'
+    from_xml, from_dict = mi.load_string(xml), nirc(train_frames=10)
+    assert str(from_xml).split("frames")[0] == str(from_dict).split("frames")[0]
+    a = np.array(mi.render(sphere, integrator=from_xml, spp=4, seed=2))
+    b = render(sphere, from_dict, 4, 2)
+    c = np.array(from_dict.render(sphere, sphere.sensors()[0], seed=mi.UInt32(2), spp=4))
+    np.testing.assert_allclose(a, b, rtol=1e-2)
+    assert np.array_equal(b, c)
+
+
+def test_samples_of_the_scene_file_are_used_when_none_are_given(sphere):
+    integrator = nirc(train_frames=1)
+    before = integrator.statistics()["queries"]
+    integrator.render(sphere)
+    assert integrator.statistics()["queries"] - before == integrator.queries_per_sample * 16 * 16 * 64
+
+
+def test_wrapped_in_aov_it_shows_the_same_light(sphere):
+    wrapped = mi.load_dict({"type": "aov", "aovs": "d:depth,n:sh_normal", "inner": {**SMALL, "channels": "direct"}})
+    image = np.array(mi.render(sphere, integrator=wrapped, spp=32), dtype=np.float64)
+    names = wrapped.aov_names()
+    assert image.shape[-1] == 3 + len(names) - 4 or image.shape[-1] == len(names)
+    assert np.isfinite(image).all()
+    assert image[..., :3].mean() == pytest.approx(1, rel=0.03)
+
+
+def test_render_leaves_gradients_of_the_caller_alone(sphere):
+    x = mi.Float(2)
+    dr.enable_grad(x)
+    y = x * x
+    render(sphere, nirc(train_frames=2), 1)
+    dr.backward(y)
+    assert dr.grad(x)[0] == 4
+
+
+# ---------------------------------------------------------------- films
+
+
+FILMS = {
+    "crop": {"crop_offset_x": 3, "crop_offset_y": 5, "crop_width": 9, "crop_height": 6},
+    "gaussian": {"rfilter": {"type": "gaussian"}},
+    "border": {"rfilter": {"type": "gaussian"}, "sample_border": True},
+    "box_border_crop": {"sample_border": True, "crop_offset_x": 3, "crop_width": 9},
+    "rgba": {"pixel_format": "rgba"},
+    "luminance": {"pixel_format": "luminance"},
+    "one_pixel": {"width": 1, "height": 1},
+    "wide": {"width": 512, "height": 2},
+}
+
+
+@pytest.mark.parametrize("name", FILMS)
+def test_film_shows_what_it_shows_with_path(mixed, name):
+    """Direct light, which both integrators give without bias. For `rgba` the coverage too."""
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, **FILMS[name]}
+    to_world = mi.ScalarTransform4f().look_at([0, 3, 5], [0, 0.5, 0], [0, 1, 0])
+    sensor = mi.load_dict({"type": "perspective", "fov": 60, "to_world": to_world, "film": film})
+    images = []
+    for type_, seed in (("nirc", 0), ("path", 100)):
+        integrator = mi.load_dict({"type": type_, "max_depth": 2, "hide_emitters": name == "rgba"})
+        images.append([np.array(mi.render(mixed, sensor=sensor, integrator=integrator, spp=32, seed=seed + k))
+                       for k in range(12)])  # fmt: skip
+    ours, path = np.array(images, dtype=np.float64)
+    assert ours.shape == path.shape and np.isfinite(ours).all()
+    blocks = 1 if name == "one_pixel" else (2 if name == "wide" else 3)
+    if name == "rgba":
+        assert_same_mean(ours[..., 3:], path[..., 3:], "alpha", blocks, relative=1e-5)
+    assert_same_mean(ours[..., :3], path[..., :3], name, blocks, relative=1e-5)
+
+
+@pytest.mark.parametrize("name", ["gaussian", "one_pixel", "wide"])
+def test_film_with_the_cache(sphere, trained, name):
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, **FILMS[name]}
+    to_world = mi.ScalarTransform4f().look_at([0.3, 0.2, 0.4], [-0.5, -0.2, -0.6], [0, 1, 0])
+    sensor = mi.load_dict({"type": "perspective", "fov": 70, "to_world": to_world, "film": film})
+    image = np.array(trained.render(sphere, sensor, spp=16))
+    assert np.isfinite(image).all() and image[..., :3].mean() == pytest.approx(1, rel=0.03)
+    assert np.abs(image[..., :3] - 1).max() < 0.4
+
+
+def test_thin_lens_and_moving_shutter_render(mixed):
+    sensor = mi.load_dict({
+        "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 5.0, "fov": 60, "shutter_open": 0.0,
+        "shutter_close": 1.0, "to_world": mi.ScalarTransform4f().look_at([0, 3, 5], [0, 0.5, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
+    })  # fmt: skip
+    ours, path = (
+        np.stack([np.array(mi.render(mixed, sensor=sensor, integrator=mi.load_dict({"type": t, "max_depth": 2}),
+                                     spp=32, seed=100 * s + k)) for k in range(12)])
+        for s, t in enumerate(("nirc", "path"))
+    )  # fmt: skip
+    assert_same_mean(ours, path, "thin lens", relative=1e-5)
+
+
+def test_each_sensor_of_a_scene_shows_its_own_view(mixed):
+    def sensor(z, size):
+        return {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 1, z], [0, 0.5, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}}  # fmt: skip
+
+    scene = mi.load_dict({"type": "scene", **lights("constant"), "a": sensor(5, 8), "b": sensor(0.5, 12),
+                          "floor": {"type": "rectangle"}})  # fmt: skip
+    integrator = nirc(train_frames=3, train_steps=1)
+    path = mi.load_dict({"type": "path"})
+    for k in (0, 1, 0):
+        image = render(scene, integrator, 64, sensor=k)
+        expected = np.array(mi.render(scene, sensor=k, integrator=path, spp=256))
+        assert image.shape == expected.shape
+        assert image.mean() == pytest.approx(expected.mean(), rel=0.03)
+    assert integrator.cache.steps == 5  # one cache for all views of a scene
+
+
+# ---------------------------------------------------------------- refused
+
+
+@pytest.mark.parametrize("key, value", [
+    ("max_depth", -2), ("rr_depth", 0), ("train_frames", -2), ("train_steps", -1), ("seed", -1), ("learning_rate", 0.0),
+    ("learning_rate", -1.0), ("ema_decay", 1.5), ("ema_decay", -0.5), ("cache_samples", -1), ("light_samples", 0),
+    ("spread_threshold", -1.0), ("gather_half", -1.0), ("train_samples", 0), ("train_vertices", 1), ("levels", 0),
+    ("hashmap_size", 33), ("width", 0), ("hidden_layers", 0), ("termination", "never"), ("channels", "direct,depht"),
+])  # fmt: skip
+def test_impossible_key_is_refused_by_name(key, value):
+    with pytest.raises((ValueError, RuntimeError)) as error:
+        mi.load_dict({"type": "nirc", key: value})
+    text = str(error.value)
+    print(text)
+    names = {"train_samples": "n_paths", "train_vertices": "n_vertices", "levels": "n_levels", "hidden_layers": "n_hidden"}
+    assert "nirc:" in text and str(value).split(",")[-1] in text
+    assert {"channels": "channel"}.get(key, key) in text, f"the message names {names.get(key)}, the user typed {key}"
+
+
+def test_value_of_the_wrong_type_and_unknown_key_are_refused():
+    with pytest.raises((ValueError, RuntimeError, TypeError)):
+        mi.load_dict({"type": "nirc", "cache_samples": "many"})
+    with pytest.raises((ValueError, RuntimeError), match="cache_sample"):
+        mi.load_string('<integrator type="nirc" version="3.0.0"><integer name="cache_sample" value="4"/></integrator>')
+
+
+def refused(scene, match, sensor=0):
+    integrator = nirc(train_frames=1)
+    with pytest.raises(ValueError, match=match):
+        integrator.render(scene, sensor, spp=1)
+    assert integrator.cache.steps == 0 and integrator.cache.field is None
+    with pytest.raises(ValueError, match=match):
+        integrator.train(scene, 1, sensor)
+
+
+FLOOR = {"type": "scene", "floor": {"type": "rectangle"}}
+CAMERA = {"camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}}
+
+
+def test_scene_without_emitters_is_refused():
+    refused(mi.load_dict({**FLOOR, **CAMERA}), "nirc: the scene has no emitter.*add a light")
+
+
+def test_scene_without_sensors_is_refused():
+    refused(mi.load_dict({**FLOOR, **LIGHTS["constant"]}), "nirc: the scene has no sensor; add one")
+
+
+def test_scene_with_a_medium_is_refused_and_the_right_integrator_named():
+    fog = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}}
+    refused(mi.load_dict({**FLOOR, **CAMERA, **LIGHTS["constant"], "fog": fog}), "participating medium.*volpath")
+
+
+def test_camera_inside_a_medium_is_refused():
+    camera = {"camera": {**CAMERA["camera"], "medium": {"type": "homogeneous", "albedo": 0.5}}}
+    refused(mi.load_dict({**FLOOR, **camera, **LIGHTS["constant"]}), "medium.*volpath")
+
+
+@pytest.mark.parametrize("index", [1, 7, -1])
+def test_sensor_that_does_not_exist_is_refused(index):
+    scene = mi.load_dict({**FLOOR, **CAMERA, **LIGHTS["constant"]})
+    refused(scene, f"there is no sensor {index}; the scene has 1", index)
+
+
+def test_negative_sample_count_is_refused(sphere):
+    with pytest.raises((ValueError, TypeError, OverflowError)):
+        nirc(train_frames=1).render(sphere, spp=-4)
