@@ -106,6 +106,8 @@ class _State:
         self.passes: dict = {}
         self.planned_spp: int | None = None
         self.ns_per_query = math.nan
+        self.facts: dict = {}  # what was measured of the scene `facts_key`
+        self.facts_key = None
         self.reset()
 
     def reset(self) -> None:
@@ -113,7 +115,6 @@ class _State:
         self.images = 0
         self.queries = 0.0
         self.nonfinite: list = []
-        self.facts: dict = {}  # what was measured of the scene
         self.image_open = False
 
 
@@ -207,7 +208,10 @@ class CacheIntegrator(mi.SamplingIntegrator):
             check_scene(scene, self.plugin)
             if self.state.scene_key is not None:
                 self.reset()
+                self.state.passes.clear()  # recordings of the other scene
             self.state.scene_key, self.state.signature = key, scene_signature(scene)
+        if key != self.state.facts_key:
+            self.state.facts, self.state.facts_key = {}, key
         if not self.needs_cache:
             if not self.state.facts:
                 self.settle(scene, sensor)

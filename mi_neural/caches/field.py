@@ -79,7 +79,7 @@ class _Weights:
 
     DRJIT_STRUCT = {"grid": object, "mlp": object, "packed": object, "order": object}  # noqa: RUF012
 
-    def __init__(self, shape: FieldShape, seed: int):
+    def __init__(self, shape: FieldShape, seed: int, half: bool | None = None):
         # The grid starts near 0; anything from 1e-4 to 1e-1 trained alike
         self.grid = nn.HashGridEncoding(
             mi.Float, 3, n_levels=shape.n_levels, n_features_per_level=shape.n_features,
@@ -92,14 +92,22 @@ class _Weights:
         network = nn.Sequential(*layers, nn.Linear(-1, shape.n_outputs))
         self.mlp = network.alloc(mi.TensorXf, shape.n_inputs, rng=dr.rng(seed=2 * seed + 1))
 
-        # nn.pack() cannot be frozen, so what it does is read off once: pack the numbers 1, 2, ...
-        numbered = network.alloc(mi.TensorXf, shape.n_inputs)
-        start = 1
-        for k, v in numbered.items():
-            numbered[k] = mi.TensorXf(dr.arange(mi.Float, start, start + dr.prod(v.shape)), shape=v.shape)
-            start += dr.prod(v.shape)
-        self.packed = nn.pack(numbered)
-        self.order = mi.UInt32(dr.round(mi.Float(self.packed["weights"])))  # 0: padding
+        # The one place where back ends differ: OptiX multiplies cooperative vectors in half precision, LLVM in single
+        self.half = dr.backend_v(mi.Float) == dr.JitBackend.CUDA if half is None else half
+        storage = mi.TensorXf16 if self.half else mi.TensorXf
+        # nn.pack() cannot be frozen, so the order it gives is read off once, by packing the numbers 1, 2, ... digit by
+        # digit (half precision counts to 2048)
+        digits = []
+        for divisor in (1, 1024):
+            numbered, start = network.alloc(storage, shape.n_inputs), 1
+            for k, v in self.mlp.items():
+                size = dr.prod(v.shape)
+                digit = (dr.arange(mi.UInt32, start, start + size) // divisor) % 1024
+                numbered[k] = storage(digit, shape=v.shape)
+                start += size
+            self.packed = nn.pack(numbered)
+            digits.append(mi.UInt32(dr.round(mi.Float(self.packed["weights"]))))
+        self.order = digits[0] + 1024 * digits[1]  # 0: padding
         self.pack()
 
     def parameters(self) -> dict:
@@ -115,7 +123,14 @@ class _Weights:
     def pack(self) -> None:
         """Bring the packed MLP up to date."""
         flat = dr.concat([mi.Float(0), *(dr.detach(v).array for v in self.mlp.values())])
-        self.packed["weights"] = dr.gather(mi.Float, flat, self.order)
+        weights = dr.gather(mi.Float, flat, self.order)
+        self.packed["weights"] = type(self.packed["weights"])(weights)
+
+    def __call__(self, inputs: list) -> list:
+        """The MLP's outputs by cooperative vectors."""
+        if self.half:
+            inputs = [mi.Float16(i) for i in inputs]
+        return [mi.Float(o) for o in self.packed(nn.CoopVec(*inputs))]
 
 
 class Field:
@@ -189,8 +204,7 @@ class Field:
     def raw(self, features: list, w, averaged: bool = True):
         """The network's output over `scale`, not clamped."""
         weights = self.averaged if averaged else self.current
-        out = weights.packed(nn.CoopVec(*features, *encoding.direction(w, self.shape.direction_degree)))
-        return mi.Color3f(*out) + 1
+        return mi.Color3f(*weights([*features, *encoding.direction(w, self.shape.direction_degree)])) + 1
 
     def query(self, features: list, w, averaged: bool = True):
         """Radiance from direction `w` (unit, away from the surface) at the encoded position; never negative."""

@@ -151,7 +151,7 @@ class IncidentCache:
     def __init__(self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0):
         self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
         self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
-        self._probe = dr.freeze(lambda scene, sensor, seed: trace_records(scene, sensor, None, self.training, seed))
+        self._probe = dr.freeze(self._probe_plain, auto_opaque=False)
         self.reset()
 
     def reset(self) -> None:
@@ -167,6 +167,9 @@ class IncidentCache:
         }  # fmt: skip
 
     # -------------------------------------------------------------------------------------------------------------
+
+    def _probe_plain(self, scene, sensor, seed):
+        return trace_records(scene, sensor, None, self.training, seed)
 
     def _frame_plain(self, scene, sensor, field, seed, learning_rate, decay):
         with dr.suspend_grad():
