@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/mi_neural.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint clean
+.PHONY: help demo picture test lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -22,8 +22,16 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet -e '.[denoise,test]'
 	@touch $@
 
-demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EXR and PNG in out/demo
-	$(BIN)/mi-neural compare ajar_door -i path -i nirc --seconds 5,20 --denoise -o out/demo
+demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EXR, PNG, report in out/demo
+	$(BIN)/mi-neural compare ajar_door -i path -i nirc --seconds 5 --steady 200 --frame-seconds 0.25,1 --denoise \
+	    --reference scenes/ajar_door_320x180.exr -o out/demo
+	@echo "Open out/demo/report.html"
+
+picture: $(STAMP)  ## the README's picture
+	$(BIN)/mi-neural compare ajar_door -i path -i nirc --size 480x270 --steady 300 --frame-seconds 1 --denoise \
+	    --reference-spp 64 -o out/picture
+	$(BIN)/python -m mi_neural.measure.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
+	    out/picture/path_$(k) out/picture/nirc_$(k))
 
 test: $(STAMP)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest

@@ -224,11 +224,22 @@ class CacheIntegrator(mi.SamplingIntegrator):
                     self.settle(scene, sensor)
             if train and not self.freeze_cache and not self.state.image_open:
                 if self.state.images == 0 and self.cache.steps == 0:
-                    auto = self.train_frames < 0
-                    self.cache.train(scene, sensor, frames=None if auto else self.train_frames,
-                                     at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1])  # fmt: skip
+                    self._train_first(scene, sensor)
                 else:
                     self.cache.train(scene, sensor, frames=self.train_steps)
+
+    def _train_first(self, scene, sensor, progress=None) -> None:
+        auto = self.train_frames < 0
+        self.cache.train(scene, sensor, frames=None if auto else self.train_frames,
+                         at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1], progress=progress)  # fmt: skip
+
+    def train_first(self, scene, sensor=0, progress=None) -> dict:
+        """Train now as the first image would (`train_frames`), if nothing was learned yet. Returns the statistics."""
+        sensor = self._sensor(scene, sensor)
+        self._ready(scene, sensor, train=False)
+        if self.needs_cache and not self.freeze_cache and self.cache.steps == 0:
+            self._train_first(scene, sensor, progress)
+        return self.statistics()
 
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train `frames` frames now. `progress` is called with (done, total). Returns :meth:`statistics`."""

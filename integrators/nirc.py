@@ -23,10 +23,10 @@ class NIRCIntegrator(CacheIntegrator):
         self.light_samples = props.get("light_samples", -1)
         self.termination = props.get("termination", "adaptive")
         self.spread_threshold = props.get("spread_threshold", 0.01)
-        self.gather_half = props.get("gather_half", 8.0)
+        self.gather_half = props.get("gather_half", 4.0)
         self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
         self._check(self.light_samples == -1 or self.light_samples >= 1,
-                    f"light_samples is {self.light_samples}; give -1 (by the noise of direct light), 1 or more")  # fmt: skip
+                    f"light_samples is {self.light_samples}; give -1 (chosen by noise) or at least 1")  # fmt: skip
         self._check(self.termination in TERMINATIONS,
                     f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
@@ -53,7 +53,7 @@ class NIRCIntegrator(CacheIntegrator):
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(AA), mi.Point2f(0.5))
-        L, β, ray, si, _, active, sampler = self.first_vertex(scene, sampler, ray, mi.Bool(True))
+        L, β, ray, si, _, _, active, sampler = self.first_vertex(scene, sampler, ray, mi.Bool(True))
         bsdf = si.bsdf(ray)
 
         def once(k, mean, square, sampler):
@@ -70,7 +70,9 @@ class NIRCIntegrator(CacheIntegrator):
         )
         variance = np.array(dr.maximum(square - dr.square(mean), 0)) * (4 / 3)
         # Relative to the brightness of the place, the scene's mean being its floor
-        level = float(np.mean(np.array(mean + dr.mean(L)))) + (float(self.cache.field.scale[0]) if self.cache.field else 0)
+        level = float(np.mean(np.array(mean + dr.mean(L))))
+        if self.cache.field is not None:
+            level += float(self.cache.field.scale[0])
         noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
         self.state.facts["direct_noise"] = float(noise)
         self.state.facts["light_samples"] = 1 if noise < 0.02 else 2 if noise < 0.08 else 4
@@ -86,7 +88,7 @@ class NIRCIntegrator(CacheIntegrator):
 
     def estimate(self, scene, field, sampler, ray, mixture, active):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
-        L, β, ray, si, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
+        L, β, ray, si, depth, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
         bsdf = si.bsdf(ray)
         n_light = self.n_light
         cached = self.needs_cache and field is not None
@@ -131,7 +133,9 @@ class NIRCIntegrator(CacheIntegrator):
             far = dr.select(mi.Float(i) < n_gather, mixture * n_light / n_gather, 0)
             share = self.gather_share(delta, bs.pdf, spread, a_0, far) if cached else mi.Float(1)
             follow = alive & (share > 0) & si_next.is_valid()
-            Li, sampler = self.gather(scene, field, sampler, next_ray, si_next, weight, bs, spread, a_0, follow)
+            Li, sampler = self.gather(
+                scene, field, sampler, next_ray, si_next, depth + 1, weight, bs, spread, a_0, follow
+            )
             residual += dr.select(alive, share * (Li - Li_cache), 0)
             return i + 1, direct, cache, residual, sampler
 
@@ -166,7 +170,8 @@ class NIRCIntegrator(CacheIntegrator):
     def first_vertex(self, scene, sampler, ray, active):
         """Follow the camera ray through delta surfaces to the first one with a smooth lobe.
 
-        Returns (emission on the way, throughput, last ray, its intersection, visible, active, sampler).
+        Returns (emission on the way, throughput, last ray, its intersection, segments traced, visible, active,
+        sampler).
         """
         ctx = mi.BSDFContext()
         ray = mi.RayDifferential3f(ray)
@@ -211,7 +216,7 @@ class NIRCIntegrator(CacheIntegrator):
         si_chain = scene.ray_intersect(ray, chain & (dr.max(β) > 0))
         si = dr.select(chain, si_chain, si)
         active = (dr.max(β) > 0) & si.is_valid() & (depth + 1 < max_depth)
-        return L, β, ray, si, visible, active, sampler
+        return L, β, ray, si, depth + 1, visible, active, sampler
 
     def gather_share(self, delta, pdf, spread, a_0, far):
         """How much of a direction's light is gathered at what it meets, instead of read from the cache here.
@@ -227,13 +232,16 @@ class NIRCIntegrator(CacheIntegrator):
             share = 1 - termination.balanced_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)
 
-    def gather(self, scene, field, sampler, ray, si, β, bs, spread, a_0, active):
-        """Light that `si` reflects back along `ray`, times β: next-event estimation there, the rest from the cache at
-        the first vertex where the path is wide enough, by path tracing up to there."""
+    def gather(self, scene, field, sampler, ray, si, depth, β, bs, spread, a_0, active):
+        """Light that `si`, `depth` segments from the camera, reflects back along `ray`, times β.
+
+        Next-event estimation there, the rest from the cache at the first vertex where the path is wide enough, by path
+        tracing up to there.
+        """
         ctx = mi.BSDFContext()
         cached = self.needs_cache and field is not None
         max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
-        active = active & (max_depth > 2)
+        active = active & (depth < max_depth)
 
         def one_vertex(depth, ray, si, β, η, L, spread, active, sampler):
             bsdf = si.bsdf(ray)
@@ -256,7 +264,7 @@ class NIRCIntegrator(CacheIntegrator):
                 L += dr.select(stop, β * field.query(field.encode(si.p), wo), 0)
             η *= bs.eta
             depth += 1
-            active &= ~stop & (dr.max(β) > 0) & (depth < max_depth)
+            active &= ~stop & (dr.max(β) > 0)
             roulette = depth >= self.rr_depth
             q = dr.minimum(dr.max(β) * η**2, 0.95)
             active &= ~roulette | (sampler.next_1d() < q)
@@ -266,13 +274,13 @@ class NIRCIntegrator(CacheIntegrator):
             next_ray = si.spawn_ray(wo)
             si_next = scene.ray_intersect(next_ray, active)
             L += β * vertex.emission_mis(scene, si_next, si.p, si.n, bs.pdf, delta, active)
-            active &= si_next.is_valid() & (depth + 1 < max_depth)
+            active &= si_next.is_valid() & (depth < max_depth)
             spread += dr.select(
                 delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
             )
             return depth, next_ray, si_next, β, η, L, spread, active, sampler
 
-        state = (mi.UInt32(2), mi.Ray3f(ray), si, mi.Color3f(β), mi.Float(bs.eta), mi.Color3f(0), mi.Float(spread),
+        state = (mi.UInt32(depth), mi.Ray3f(ray), si, mi.Color3f(β), mi.Float(bs.eta), mi.Color3f(0), mi.Float(spread),
                  mi.Bool(active), sampler)  # fmt: skip
         _, _, _, _, _, L, _, _, sampler = dr.while_loop(
             state, lambda depth, ray, si, β, η, L, spread, active, sampler: active, one_vertex, label="gather"
@@ -282,7 +290,8 @@ class NIRCIntegrator(CacheIntegrator):
     def to_string(self):
         return (
             f"NIRCIntegrator[\n  termination = {self.termination},\n  cache_samples = {self.cache_samples},\n"
-            f"  light_samples = {self.n_light}{' (chosen)' if self.light_samples < 0 else ''},\n  max_depth = {self.max_depth},\n"
+            f"  light_samples = {self.n_light}{' (chosen)' if self.light_samples < 0 else ''},\n"
+            f"  max_depth = {self.max_depth},\n"
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
             f"  frames trained = {self.cache.steps}\n]"
         )
@@ -310,7 +319,7 @@ NIRCIntegrator.__doc__ = (
     :math:`u` that is 1 for mirrors, sharp lobes and surfaces so near that the cache would blur what the pixel sees, and
     elsewhere depends on ``termination``. :math:`E[L_o]` is the path-traced radiance if the cache is exact.
 
-    What the cache holds: light reflected at least once, next-event estimation included. What it does not hold: emission.
+    What the cache holds: light reflected at least once, next-event estimation included. What it does not: emission.
 
     .. pluginparameters::
 
@@ -333,7 +342,7 @@ NIRCIntegrator.__doc__ = (
        - Constant c of the spread test a > c a_0; 0: no surface is too near. (Default: 0.01)
      * - gather_half
        - |float|
-       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 8)
+       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)
     """
     + SHARED_KEYS.strip("\n")
     + r"""

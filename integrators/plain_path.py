@@ -32,7 +32,7 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
 
-    *Works with* all surfaces and emitters of Mitsuba. *Leaves out* participating media (use ``volpath``) and polarization.
+    *Works with* all surfaces and emitters of Mitsuba. *Leaves out* participating media (use ``volpath``), polarization.
 
     .. tabs::
         .. code-tab:: xml

@@ -155,6 +155,10 @@ def render(
             case.integrator.load_cache(str(load_cache))
         bars_pretrain = bars(f"training {pretrain} frames") if pretrain else None
         seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
+        seconds_first = 0.0
+        if seconds is None and not stopped:
+            bars_first = bars("training") if hasattr(case.integrator, "train_first") else None
+            seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
         if stopped:  # the image that can be had at once
             rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
             rendered.interrupted = True
@@ -171,6 +175,7 @@ def render(
             rendered = budget.render_samples(
                 loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel")
             )
+        rendered.seconds_train += seconds_first
         image, seconds_denoise = rendered.rgb, 0.0
         if denoise_:
             image, seconds_denoise = denoise.denoise(rendered.rgb, guides)

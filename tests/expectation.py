@@ -44,8 +44,9 @@ def assert_same_mean(a: np.ndarray, b: np.ndarray, what: str = "", blocks: int =
     bound = stats.t.isf(each / 2, np.maximum(dof, 1)) * np.sqrt(va + vb) + relative * np.abs(mean)
     error = np.abs(a.mean(axis=1) - mean)
     worst = np.argmax(error - bound)
+    visible = bound / np.maximum(np.abs(mean), 1e-30)
     print(
-        f"{what}: means {a.mean(axis=1)[0]:.5g} and {mean[0]:.5g}; smallest visible bias {bound[0] / mean[0]:.1e} of the "
-        f"image, {np.max(bound / np.maximum(np.abs(mean), 1e-30)):.1e} of a block; worst part {worst}: off by {error[worst]:.1e} of {bound[worst]:.1e}"
+        f"{what}: {a.mean(axis=1)[0]:.5g} and {mean[0]:.5g}; smallest visible bias {visible[0]:.1e} of the image, "
+        f"{visible.max():.1e} of a block; worst part {worst}: off by {error[worst]:.1e} of {bound[worst]:.1e}"
     )
     assert (error <= bound).all()

@@ -291,13 +291,13 @@ def test_impossible_shape_is_refused_by_name(key, value):
     ([0, 0, 0], [1, 0, 1]), ([0, 0, 0], [-1, 1, 1]), ([0, 0, np.nan], [1, 1, 1]), ([0, 0, 0], [1, np.inf, 1]),
 ])  # fmt: skip
 def test_empty_box_is_refused(low, high):
-    with pytest.raises(ValueError, match="the box .* is empty or not finite"):
+    with pytest.raises(ValueError, match=r"the box .* is empty or not finite"):
         Field(low, high, TINY)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
 def test_impossible_scale_is_refused(scale):
-    with pytest.raises(ValueError, match="scale is .*positive"):
+    with pytest.raises(ValueError, match=r"scale is .*positive"):
         make(scale=scale)
 
 
@@ -410,8 +410,8 @@ def test_file_of_another_version_says_so_and_what_to_do(saved, version):
 
 
 @pytest.mark.parametrize("change", [
-    {"scale": 0}, {"scale": "big"}, {"scale": float("nan")}, {"box": [[0, 0, 0], [0, 0, 0]]}, {"box": []}, {"shape": {}},
-    {"shape": {"width": -1}}, {"shape": {"unknown": 1}}, {"seed": "x"}, {"steps": "many"}, {"steps": -5},
+    {"scale": 0}, {"scale": "big"}, {"scale": float("nan")}, {"box": [[0, 0, 0], [0, 0, 0]]}, {"box": []},
+    {"shape": {}}, {"shape": {"width": -1}}, {"shape": {"unknown": 1}}, {"seed": "x"}, {"steps": "many"}, {"steps": -5},
     {"mean": float("nan")}, {"mean": -1.0}, {"mean": None},
 ], ids=str)  # fmt: skip
 def test_file_with_an_impossible_header_is_refused(saved, change):

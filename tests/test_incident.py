@@ -153,7 +153,7 @@ def test_targets_that_are_not_finite_are_counted_and_left_out():
     """One wall of six emits NaN: what met it is counted, the rest trains."""
     scene, sensor = load()
     params = mi.traverse(scene)
-    key = next(k for k in params.keys() if k.endswith("emitter.radiance.value"))  # noqa: SIM118
+    key = next(k for k in params.keys() if k.endswith("emitter.radiance.value"))
     params[key] = mi.Color3f(float("nan"), 0.5, 0.5)
     params.update()
     records, n_bad = trace_records(scene, sensor, None, SMALL, mi.UInt32(1))
@@ -204,6 +204,7 @@ def test_statistics_count_what_was_done(trained):
 
 def test_equal_seeds_give_equal_caches_and_others_do_not(cube):
     """Up to the order in which threads sum up gradients."""
+
     def cache(seed):
         c = IncidentCache(SMALL, seed=seed)
         c.train(*cube, frames=20)

@@ -53,7 +53,7 @@ def test_independent_numbers_are_uniform_and_pairs_of_them():
 @pytest.mark.parametrize("start", [0, 512])
 @pytest.mark.parametrize("k", [1, 2, 4, 6, 9])
 def test_every_power_of_two_is_stratified(k, start):
-    """2^k points, beginning at a multiple of 2^k: one in each elementary interval, of whatever shape ((0,2)-sequence)."""
+    """2^k points, beginning at a multiple of 2^k: one in each elementary interval of whatever shape."""
     for pixel in range(3):
         x, y = points(pixel, start + np.arange(2**k))
         for a in range(k + 1):

@@ -89,7 +89,8 @@ def test_mis_weights_sum_to_one(rng):
     a, b = (mi.Float((10.0 ** rng.uniform(-6, 6, 256)).astype("f4")) for _ in range(2))
     found = np.array(vertex.mis_weight(a, b) + vertex.mis_weight(b, a))
     np.testing.assert_allclose(found, 1, rtol=1e-6)
-    np.testing.assert_allclose(np.array(vertex.mis_weight(a, b)), np.array(a) ** 2 / (np.array(a) ** 2 + np.array(b) ** 2), rtol=1e-5)
+    x, y = np.array(a), np.array(b)
+    np.testing.assert_allclose(np.array(vertex.mis_weight(a, b)), x**2 / (x**2 + y**2), rtol=1e-5)
 
 
 def test_mis_weight_of_what_cannot_be_sampled_is_zero_and_never_nan():

@@ -179,7 +179,7 @@ class IncidentCache:
         return total, mean_target, dr.count(records.valid), n_bad
 
     def start(self, scene, sensor) -> None:
-        """Measure where light is asked for and how bright it is, and make the field. One batch of paths, no training."""
+        """Measure where light is asked for and how bright it is, and make the field; no training."""
         with dr.suspend_grad():
             records, _ = self._probe(scene, sensor, mi.UInt32(self._seed(0xFFFFFF)))
             valid = np.array(records.valid)

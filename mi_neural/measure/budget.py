@@ -2,8 +2,8 @@
 
 Dr.Jit works asynchronously: the clock is read after ``dr.sync_thread()`` only. Kernels are compiled before it starts
 (:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; what an integrator
-with a cache can do beyond Mitsuba's own is looked up by name: `train`, `train_seconds`, `train_fraction`, `prepare`,
-`plan_samples`, `statistics`, `reset`.
+with a cache can do beyond Mitsuba's own is looked up by name: `train`, `train_seconds`, `train_first`,
+`train_fraction`, `prepare`, `plan_samples`, `statistics`, `reset`.
 
 Ctrl-C ends a rendering early and keeps what has been rendered; the result says so. During training it ends the
 training, and one pass is rendered with what has been learned.
@@ -166,6 +166,18 @@ def train(scene, integrator, frames: int, sensor: int = 0, progress: Progress | 
     start, interrupted = clock(), False
     try:
         integrator.train(scene, frames, sensor=sensor, progress=progress)
+    except KeyboardInterrupt:
+        interrupted = True
+    return clock() - start, interrupted
+
+
+def train_first(scene, integrator, sensor: int = 0, progress: Progress | None = None) -> tuple[float, bool]:
+    """Train as the first image would; returns (seconds, interrupted). Nothing for an integrator without a cache."""
+    if not hasattr(integrator, "train_first"):
+        return 0.0, False
+    start, interrupted = clock(), False
+    try:
+        integrator.train_first(scene, sensor=sensor, progress=progress)
     except KeyboardInterrupt:
         interrupted = True
     return clock() - start, interrupted

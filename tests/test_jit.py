@@ -1,0 +1,144 @@
+"""Compilation: frozen = plain = evaluated loops; a constant number of recordings, kernels and bytes; passes."""
+
+import gc
+import importlib
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from expectation import assert_same_mean
+from test_incident import load
+
+SMALL = {"type": "nirc", "train_samples": 512, "train_frames": 10, "train_steps": 0}
+
+
+def render(scene, integrator, spp=4, seed=1):
+    return np.array(integrator.render(scene, spp=spp, seed=seed), dtype=np.float64)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return load("point_lit_sphere", 16)[0]
+
+
+@pytest.fixture(scope="module")
+def trained(sphere):
+    integrator = mi.load_dict(SMALL)
+    integrator.train(sphere, 40)
+    return integrator
+
+
+@pytest.fixture(scope="module")
+def running(sphere):
+    """An integrator in the middle of a sequence: every image is preceded by a training frame."""
+    integrator = mi.load_dict({**SMALL, "train_steps": 1})
+    for k in range(6):
+        render(sphere, integrator, 2, k)
+    return integrator
+
+
+def recordings(integrator) -> list[int]:
+    return [integrator.cache._frame.n_recordings, *(p.n_recordings for p in integrator.state.passes.values())]
+
+
+def test_number_of_recordings_is_constant_over_frames(sphere, running):
+    before = recordings(running)
+    print(f"recordings of the training frame and of the passes: {before}")
+    assert max(before) <= 3
+    for k in range(10):
+        render(sphere, running, 2, 100 + k)
+    assert recordings(running) == before
+
+
+def test_recordings_survive_a_reset(sphere, running):
+    before = recordings(running)
+    running.reset()
+    for k in range(2):
+        render(sphere, running, 2, k)
+    after = recordings(running)
+    assert sum(after) <= sum(before) + 1, (before, after)
+
+
+def test_no_kernel_is_compiled_and_no_byte_kept_over_forty_frames(sphere, running):
+    def memory() -> int:
+        gc.collect()
+        dr.sync_thread()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096  # resident
+
+    for k in range(10):
+        render(sphere, running, 2, k)
+    start = memory()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        counts = []
+        for k in range(40):
+            dr.kernel_history_clear()
+            render(sphere, running, 2, 200 + k)
+            history = [h for h in dr.kernel_history() if h["type"] == dr.KernelType.JIT]
+            assert all(h["cache_hit"] for h in history), "a kernel was compiled"
+            counts.append(len(history))
+        dr.kernel_history_clear()
+    grown = memory() - start
+    print(f"kernels per frame {counts[0]}..{counts[-1]}, memory grown by {grown / 2**20:.1f} MiB")
+    assert len(set(counts)) == 1
+    assert grown < 24 * 2**20
+
+
+def test_frozen_plain_and_evaluated_give_equal_images(sphere, trained):
+    frozen = render(sphere, trained)
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        plain = render(sphere, trained)
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+            evaluated = render(sphere, trained)
+    np.testing.assert_allclose(plain, frozen, rtol=1e-5)
+    np.testing.assert_allclose(evaluated, frozen, rtol=1e-5)
+
+
+def test_frozen_training_and_training_with_evaluated_loops_give_equal_caches(sphere):
+    """Up to the order in which threads sum up gradients."""
+    frozen, plain = (mi.load_dict({**SMALL, "train_frames": 3}) for _ in range(2))
+    image = render(sphere, frozen)
+    flags = dr.JitFlag.KernelFreezing, dr.JitFlag.SymbolicLoops
+    with dr.scoped_set_flag(flags[0], False), dr.scoped_set_flag(flags[1], False):
+        np.testing.assert_allclose(render(sphere, plain), image, rtol=0.01)
+
+
+def test_changed_seed_is_not_baked_into_the_recording(sphere, trained):
+    images = [render(sphere, trained, seed=k) for k in range(3)]
+    assert not np.array_equal(images[0], images[1]) and not np.array_equal(images[1], images[2])
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        np.testing.assert_allclose(render(sphere, trained, seed=2), images[2], rtol=1e-5)
+
+
+@pytest.fixture
+def small_passes(monkeypatch):
+    def set_to(n):
+        monkeypatch.setattr(importlib.import_module("mi_neural.integrators.common"), "PASS_SAMPLES", n)
+
+    return set_to
+
+
+@pytest.mark.parametrize("n", [16 * 16 * 2, 16 * 4, 5])
+def test_several_passes_are_one(sphere, trained, small_passes, n):
+    """Some samples of all pixels, some rows of one sample, one row at a time: same points, same mean."""
+    whole = np.stack([render(sphere, trained, 3, k) for k in range(8)])
+    small_passes(n)
+    parts = np.stack([render(sphere, trained, 3, k) for k in range(8)])
+    assert np.array_equal(parts[0], render(sphere, trained, 3, 0)), "the same seed gives the same image"
+    assert np.isfinite(parts).all() and parts.shape == whole.shape
+    assert_same_mean(parts, whole, f"passes of {n}", relative=1e-5)
+    np.testing.assert_allclose(parts, whole, rtol=0.5)  # no pixel is missing, none counted twice
+
+
+def test_variants_can_be_switched_back_and_forth(sphere, trained, variant):
+    before = render(sphere, trained)
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(RuntimeError, match="scalar variants have no"):
+        mi.load_dict({"type": "nirc"})
+    mi.set_variant(variant)
+    assert np.array_equal(render(sphere, trained), before)
+    other = mi.load_dict({**SMALL, "train_frames": 2})
+    assert np.isfinite(render(sphere, other)).all()
+    trained.train(sphere, 1)  # no copy of its code from another variant
+    assert np.isfinite(render(sphere, trained)).all()
