@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_neural.caches.field import CacheFileError, Field, FieldShape
 from mi_neural.caches.incident import IncidentCache, Training
+from mi_neural.transport.freezing import undisturbed
 from mi_neural.transport.samples import PathSampler
 
 #: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (measured, README).
@@ -90,12 +91,33 @@ def check_scene(scene, plugin: str) -> None:
         raise ValueError(f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>")
     if not scene.emitters():
         raise ValueError(f"{plugin}: the scene has no emitter, the image would be black; add a light")
+    for sensor in scene.sensors():
+        if sensor.get_medium() is not None:
+            raise ValueError(
+                f"{plugin}: the camera is inside a participating medium, which the cache does not model; "
+                'use <integrator type="volpath"/>'
+            )
     for shape in scene.shapes():
         if shape.is_medium_transition():
             raise ValueError(
                 f"{plugin}: shape '{shape.id()}' borders a participating medium, which the cache does not model; "
                 'use <integrator type="volpath"/>'
             )
+
+
+def _other_scene(path) -> str:
+    return (
+        f"the cache in '{path}' was trained in another scene, or the geometry has changed since; "
+        "train one for this scene, or type reset()"
+    )
+
+
+def _in_keys(message: str) -> str:
+    """A message of the library in the words of the plugin's keys."""
+    for name, key in (("n_paths", "train_samples"), ("n_vertices", "train_vertices"), ("n_levels", "levels"),
+                      ("n_hidden", "hidden_layers")):  # fmt: skip
+        message = message.replace(name, key)
+    return message
 
 
 class _State:
@@ -112,6 +134,7 @@ class _State:
 
     def reset(self) -> None:
         self.scene_key = self.signature = None
+        self.loaded: tuple | None = None  # file and scene of a cache that was read
         self.images = 0
         self.queries = 0.0
         self.nonfinite: list = []
@@ -156,7 +179,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 n_hidden=props.get("hidden_layers", 2),
             )
         except ValueError as e:
-            raise ValueError(f"{self.plugin}: {e}") from None
+            raise ValueError(f"{self.plugin}: {_in_keys(str(e))}") from None
         names = [n.strip() for n in props.get("channels", "").split(",") if n.strip()]
         for n in names:
             self._check(n in self.CHANNELS, f"unknown channel '{n}'; it has: {', '.join(self.CHANNELS)}")
@@ -209,7 +232,10 @@ class CacheIntegrator(mi.SamplingIntegrator):
             if self.state.scene_key is not None:
                 self.reset()
                 self.state.passes.clear()  # recordings of the other scene
-            self.state.scene_key, self.state.signature = key, scene_signature(scene)
+            signature = scene_signature(scene)
+            if self.state.loaded is not None and self.state.loaded[1] != signature:
+                raise CacheFileError(_other_scene(*self.state.loaded[:1]))
+            self.state.scene_key, self.state.signature = key, signature
         if key != self.state.facts_key:
             self.state.facts, self.state.facts_key = {}, key
         if not self.needs_cache:
@@ -356,8 +382,9 @@ class CacheIntegrator(mi.SamplingIntegrator):
             self._ready(scene, self._sensor(scene, 0), train=False)
         known = self.state.signature
         if known is not None and header.get("scene") != known:
-            raise CacheFileError(f"'{path}' was trained in another scene (or its geometry has changed)")
+            raise CacheFileError(_other_scene(path))
         self.cache.adopt(field)
+        self.state.loaded = (path, header.get("scene"))
 
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
@@ -374,6 +401,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
         sensor = self._sensor(scene, sensor)
+        self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
         spp = spp or sensor.sampler().sample_count()
         with dr.suspend_grad():
             self._ready(scene, sensor)
@@ -410,11 +438,14 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 n_rows = min(rows, height - y)
                 key = (id(scene), id(sensor), width, n_rows, n, box, border)
                 if key not in self.state.passes:
-                    self.state.passes[key] = self._frozen_pass(width, n_rows, n, border, box)
-                pos, values, n_bad = self.state.passes[key](
-                    scene, sensor, field, mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, done),
-                    dr.opaque(mi.UInt32, y), mixture,
-                )  # fmt: skip
+                    self.state.passes[key] = self._frozen_pass(
+                        width, n_rows, n, border, box, self.cache.freezes(sensor)
+                    )
+                with undisturbed():
+                    pos, values, n_bad = self.state.passes[key](
+                        scene, sensor, field, mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, done),
+                        dr.opaque(mi.UInt32, y), mixture,
+                    )  # fmt: skip
                 self.state.nonfinite.append(n_bad)
                 block.set_coalesce(False)
                 block.put(pos, values)
@@ -425,7 +456,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             dr.eval(self.state.nonfinite)
         return block
 
-    def _frozen_pass(self, width: int, n_rows: int, spp: int, border: int, box: bool):
+    def _frozen_pass(self, width: int, n_rows: int, spp: int, border: int, box: bool, freeze: bool):
         """A function that renders `spp` samples of some rows and returns what the film's block takes."""
 
         def render_pass(scene, sensor, field, seed, first_sample, first_row, mixture):
@@ -470,7 +501,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             dr.eval(pos, values, n_bad)
             return pos, values, n_bad
 
-        return dr.freeze(render_pass, auto_opaque=False)
+        return dr.freeze(render_pass, auto_opaque=False, enabled=freeze)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Radiance along given rays, for integrators that wrap this one (``aov``, ``moment``)."""

@@ -176,12 +176,14 @@ class NIRCIntegrator(CacheIntegrator):
         ctx = mi.BSDFContext()
         ray = mi.RayDifferential3f(ray)
         active = mi.Bool(active)
-        if self.hide:
-            ray.o = self.skip_area_emitters(scene, mi.Ray3f(ray), True, active).o
         max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
         active &= max_depth > 0
 
-        si = scene.ray_intersect(ray, active)
+        if self.hide:
+            pi = self.skip_area_emitters(scene, mi.Ray3f(ray), True, active)
+            si = pi.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, active)
+        else:
+            si = scene.ray_intersect(ray, active)
         visible = active & si.is_valid()
         shown = active & (si.is_valid() | (not self.hide))
         L = vertex.emission(scene, si, shown)

@@ -48,7 +48,7 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
         super().__init__(props)
         self.max_depth = props.get("max_depth", -1)
         self.rr_depth = props.get("rr_depth", 5)
-        self.hide_emitters = props.get("hide_emitters", False)
+        self.hide = props.get("hide_emitters", False)
         if self.max_depth < -1:
             raise ValueError(f"plain_path: max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
         if self.rr_depth < 1:
@@ -58,7 +58,7 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True):
         max_depth = mi.UInt32(self.max_depth if self.max_depth >= 0 else 0xFFFFFFFF)
         bsdf_ctx = mi.BSDFContext()
-        hide = mi.Bool(self.hide_emitters)
+        hide = mi.Bool(self.hide)
 
         ray = mi.Ray3f(dr.detach(ray))
         L = mi.Spectrum(0)  # Radiance so far
@@ -71,7 +71,11 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
         valid = mi.Bool(False)
 
         while active:
-            si = scene.ray_intersect(ray, active)
+            pi = scene.ray_intersect_preliminary(ray, active=active)
+            if dr.hint(self.hide, mode="scalar"):  # look through emitters that the camera sees
+                first = active & (depth == 0)
+                pi = dr.select(first, self.skip_area_emitters(scene, ray, True, first), pi)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             seen = (depth > 0) | ~hide
             L += β * vertex.emission_mis(scene, si, p_prev, n_prev, pdf_prev, delta_prev, active & seen)
             valid |= active & seen & (si.is_valid() | (si.emitter(scene, active) != None))  # noqa: E711

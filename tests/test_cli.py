@@ -102,10 +102,10 @@ def test_cache_is_trained_saved_and_loaded():
 
 
 def test_seconds_are_kept():
-    run("render", "cornell_box", *SMALL, "-i", "fake_cache:fraction=0.5", "--seconds", 0.3, "--json", "a.json")
+    run("render", "cornell_box", *SMALL, "-i", "fake_cache:fraction=0.5", "--seconds", 1.5, "--json", "a.json")
     facts = facts_of("a.json")
-    assert facts["budget_seconds"] == 0.3 and facts["spp"] > 1
-    assert 0.2 < facts["seconds_train"] + facts["seconds_render"] < 0.8
+    assert facts["budget_seconds"] == 1.5 and facts["spp"] > 1
+    assert 1.0 < facts["seconds_train"] + facts["seconds_render"] < 3.0
 
 
 def test_interrupt_writes_the_image_so_far():

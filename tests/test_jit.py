@@ -34,6 +34,7 @@ def trained(sphere):
 def running(sphere):
     """An integrator in the middle of a sequence: every image is preceded by a training frame."""
     integrator = mi.load_dict({**SMALL, "train_steps": 1})
+    integrator.train(sphere, 70)  # beyond the first snapshot of the weights
     for k in range(6):
         render(sphere, integrator, 2, k)
     return integrator
@@ -76,12 +77,13 @@ def test_no_kernel_is_compiled_and_no_byte_kept_over_forty_frames(sphere, runnin
             dr.kernel_history_clear()
             render(sphere, running, 2, 200 + k)
             history = [h for h in dr.kernel_history() if h["type"] == dr.KernelType.JIT]
-            assert all(h["cache_hit"] for h in history), "a kernel was compiled"
+            compiled = [h for h in history if not h["cache_hit"]]
+            assert not compiled, f"frame {k}: compiled {compiled}"
             counts.append(len(history))
         dr.kernel_history_clear()
     grown = memory() - start
     print(f"kernels per frame {counts[0]}..{counts[-1]}, memory grown by {grown / 2**20:.1f} MiB")
-    assert len(set(counts)) == 1
+    assert max(counts) <= min(counts) + 4  # a snapshot of the weights now and then
     assert grown < 24 * 2**20
 
 
@@ -142,3 +144,31 @@ def test_variants_can_be_switched_back_and_forth(sphere, trained, variant):
     assert np.isfinite(render(sphere, other)).all()
     trained.train(sphere, 1)  # no copy of its code from another variant
     assert np.isfinite(render(sphere, trained)).all()
+
+
+def test_old_scenes_collected_while_a_pass_is_recorded_do_no_harm(run_python):
+    """Destroying a scene cannot be recorded; Python's collector must not do it in the middle of a recording."""
+    code = """if True:
+        import gc
+        import mi_neural, mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        from mi_neural import scenes
+        from mi_neural.transport import vertex
+        direct_light = vertex.direct_light
+        def collect_first(*args, **kw):  # the collector may run at any time, unless it is switched off
+            if gc.isenabled():
+                gc.collect()
+            return direct_light(*args, **kw)
+        def load():
+            return mi.load_file(str(scenes.path("point_lit_sphere")), resx=4, resy=4)
+        scene, old = load(), [load()]
+        integrator = mi.load_dict({"type": "nirc", "train_samples": 64, "train_frames": 1, "light_samples": 1})
+        gc.set_threshold(10**6)
+        old.append(old)  # a cycle: only the collector frees it
+        del old
+        vertex.direct_light = collect_first
+        integrator.render(scene, spp=1)
+        assert gc.isenabled()
+        print("done")
+    """
+    assert run_python(code).stdout.splitlines()[-1] == "done"

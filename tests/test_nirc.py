@@ -113,13 +113,6 @@ def test_image_scales_with_the_light(light):
     assert difference < 0.01
 
 
-def test_scene_whose_lights_are_off_is_black():
-    scene, _ = load(light=0)
-    image = render(scene, nirc(), 4)
-    print(f"mean {image.mean():.1e}")
-    assert image.mean() < 1e-3
-
-
 def test_scene_without_indirect_light_is_that_of_path_however_dim():
     """A floor under a sky of radiance 1e-3: the cache must not glow by itself."""
     to_world = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
@@ -144,7 +137,14 @@ def test_without_cache_it_is_path(mixed, depth):
     assert_same_mean(ours, path, f"depth {depth}", relative=1e-5)
 
 
-@pytest.mark.parametrize("depth, hide", [(1, False), (2, False), (2, True), pytest.param(1, True, marks=SLOW)])
+@pytest.mark.parametrize(
+    "depth, hide",
+    [
+        (2, False),
+        (2, True),
+        *(pytest.param(1, h, marks=SLOW) for h in (False, True)),
+    ],
+)
 def test_up_to_depth_two_it_is_path(mixed, depth, hide):
     """With its cache: none is asked, and none is trained."""
     integrator = nirc(max_depth=depth, hide_emitters=hide)
@@ -223,13 +223,14 @@ def room(size=16) -> mi.Scene:
 
 @pytest.mark.parametrize("termination", ["adaptive", pytest.param("primary", marks=SLOW)])
 def test_glass_and_mirrors_show_what_path_shows(termination):
+    """Light that training paths met through a mirror is in the cache, wherever the path ended."""
     scene = room()
     image = render(scene, nirc(train_samples=1024, termination=termination), 64)
     path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
     blocks = [i.reshape(4, 4, 4, 4, 3).mean(axis=(1, 3, 4)) for i in (image, path)]
     error = np.abs(blocks[0] / blocks[1] - 1)
     print(f"mean off by {image.mean() / path.mean() - 1:+.4f}, blocks by up to {error.max():.3f}")
-    assert abs(image.mean() / path.mean() - 1) < 0.05 and error.max() < 0.25
+    assert abs(image.mean() / path.mean() - 1) < 0.025 and error.max() < 0.25  # 3 standard errors of both
 
 
 def test_room_of_mirrors_without_a_smooth_surface_renders():
@@ -300,23 +301,15 @@ def test_frozen_cache_is_not_trained(sphere):
     assert integrator.cache.steps == 0 and integrator.train_fraction(10) == 0
 
 
-def test_another_scene_starts_anew(sphere, cube):
-    integrator = nirc(train_frames=4, train_steps=1)
-    render(sphere, integrator, 1)
-    render(sphere, integrator, 1)
-    assert integrator.cache.steps == 5
-    render(cube, integrator, 1)
-    assert integrator.cache.steps == 4 and integrator.state.images == 1
-
-
-def test_another_scene_is_noticed_when_the_first_has_been_deleted():
-    """Its successor may lie at the same address."""
-    integrator = nirc(train_frames=4, train_steps=1)
+def test_another_scene_starts_anew_even_where_the_deleted_first_one_lay():
+    integrator = nirc(train_frames=4, train_steps=1, train_samples=256)
     for light in (0.5, 5.0):
         scene, _ = load(light=light, size=8)
         render(scene, integrator, 1)
         assert integrator.cache.steps == 4, "the new scene was taken for the old one"
         assert integrator.cache.field.scale[0] == pytest.approx(0.8 * light, rel=0.3)
+        render(scene, integrator, 1)
+        assert integrator.cache.steps == 5 and integrator.state.images == 2
         del scene, _
         gc.collect()
 
@@ -356,8 +349,6 @@ def test_training_by_hand_reports_progress_and_statistics(sphere):
     assert calls[-1] == (3, 3) and s["steps"] == 3 and s["records"] == 3 * 512 * 7
     s = integrator.train_seconds(sphere, 0.2)
     assert s["steps"] > 3 and s["seconds_train"] < 2
-    render(sphere, integrator, 1)  # trained already: the first image adds train_steps, not train_frames
-    assert integrator.cache.steps == s["steps"]
 
 
 def test_training_until_settled_has_its_limits(sphere, monkeypatch):
@@ -380,13 +371,6 @@ def test_equal_seeds_give_equal_images(sphere, trained):
     np.testing.assert_allclose(first, second, rtol=1e-2)  # up to the order in which threads sum up gradients
 
 
-def test_key_seed_changes_the_cache_and_nothing_else(sphere):
-    a, b = (nirc(train_frames=3, seed=s) for s in (1, 2))
-    x, y = render(sphere, a, 4), render(sphere, b, 4)
-    assert not np.array_equal(x, y)
-    assert a.cache.field.seed == 1 and b.cache.field.seed == 2
-
-
 def test_saved_cache_gives_the_same_image(sphere, cube, trained, tmp_path):
     image = render(sphere, trained, 4, 3)
     trained.save_cache(tmp_path / "c")
@@ -396,10 +380,6 @@ def test_saved_cache_gives_the_same_image(sphere, cube, trained, tmp_path):
     np.testing.assert_array_equal(render(sphere, other, 4, 3), image)
     with pytest.raises(CacheFileError, match="another scene"):
         nirc().load_cache(tmp_path / "c", cube)
-    late = nirc(train_frames=1)
-    render(cube, late, 1)
-    with pytest.raises(CacheFileError, match="another scene"):
-        late.load_cache(tmp_path / "c")
     with pytest.raises(CacheFileError, match="same sizes"):
         nirc(width=16).load_cache(tmp_path / "c")
     with pytest.raises(CacheFileError, match="no cache file"):
@@ -469,7 +449,7 @@ def test_render_leaves_gradients_of_the_caller_alone(sphere):
 
 
 #: Left out of the default run
-SLOW_FILMS = ("gaussian", "box_border_crop", "luminance")
+SLOW_FILMS = ("gaussian", "box_border_crop", "luminance", "one_pixel", "wide")
 FILMS = {
     "crop": {"crop_offset_x": 3, "crop_offset_y": 5, "crop_width": 9, "crop_height": 6},
     "gaussian": {"rfilter": {"type": "gaussian"}},
@@ -501,7 +481,7 @@ def test_film_shows_what_it_shows_with_path(mixed, name):
     assert_same_mean(ours[..., :3], path[..., :3], name, blocks, relative=1e-5)
 
 
-@pytest.mark.parametrize("name", ["gaussian", "wide"])
+@pytest.mark.parametrize("name", ["one_pixel", "wide"])
 def test_film_with_the_cache(sphere, trained, name):
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, **FILMS[name]}
     to_world = mi.ScalarTransform4f().look_at([0.3, 0.2, 0.4], [-0.5, -0.2, -0.6], [0, 1, 0])

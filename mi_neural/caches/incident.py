@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.freezing import can_freeze, undisturbed
 from ..transport.records import TrainingRecords, trace_training_paths
 from ..transport.samples import PathSampler
 from . import encoding, loss
@@ -118,7 +118,8 @@ def local_mean(field: Field, records: TrainingRecords, n: int, sampler):
 
 
 def learn(field: Field, records: TrainingRecords, training: Training, seed, learning_rate, decay):
-    """One training step on the given records. Returns (loss, mean target over `scale`), both 1-wide."""
+    """One training step on the given records. Returns (loss, mean target, mean |prediction|), 1-wide, the means over
+    `scale`."""
     n_valid = dr.maximum(dr.count(records.valid), 1)
     y = dr.select(records.valid, dr.clip(records.target / field.scale, 0, TARGET_MAX), 0)
     with dr.suspend_grad():
@@ -132,8 +133,10 @@ def learn(field: Field, records: TrainingRecords, training: Training, seed, lear
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
     total = dr.sum(dr.select(records.valid, error, 0)) / n_valid
+    mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(dr.detach(p))), 0)) / n_valid
+    dr.schedule(mean_prediction)
     field.step(total, learning_rate, decay)
-    return dr.detach(total), mean_target
+    return dr.detach(total), mean_target, mean_prediction
 
 
 class IncidentCache:
@@ -142,9 +145,10 @@ class IncidentCache:
     `statistics` counts since the start: records, steps, non-finite targets, recoveries, seconds of training.
     """
 
-    #: A loss this many times the median of the last `WINDOW` is an explosion.
-    EXPLOSION = 1e3
-    WINDOW = 32
+    #: Mean predictions this many times the mean target are an explosion.
+    EXPLOSION = 50.0
+    #: Targets this many times the brightness that the field was made for: it is made anew.
+    BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
 
@@ -152,6 +156,7 @@ class IncidentCache:
         self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
         self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
         self._probe = dr.freeze(self._probe_plain, auto_opaque=False)
+        self._sensor_freezes: dict[int, bool] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -159,7 +164,6 @@ class IncidentCache:
         self.field: Field | None = None
         self.steps = 0
         self.rate_factor = 1.0
-        self.losses: deque[float] = deque(maxlen=self.WINDOW)
         self.history: list[float] = []
         self._good: dict[str, np.ndarray] | None = None
         self.statistics = {
@@ -168,6 +172,12 @@ class IncidentCache:
 
     # -------------------------------------------------------------------------------------------------------------
 
+    def freezes(self, sensor) -> bool:
+        """Whether functions of this sensor can be frozen, see :func:`can_freeze`; tried once per sensor."""
+        if id(sensor) not in self._sensor_freezes:
+            self._sensor_freezes[id(sensor)] = can_freeze(sensor)
+        return self._sensor_freezes[id(sensor)]
+
     def _probe_plain(self, scene, sensor, seed):
         return trace_records(scene, sensor, None, self.training, seed)
 
@@ -175,13 +185,14 @@ class IncidentCache:
         with dr.suspend_grad():
             records, n_bad = trace_records(scene, sensor, field, self.training, seed)
             dr.eval(records, n_bad)
-        total, mean_target = learn(field, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
-        return total, mean_target, dr.count(records.valid), n_bad
+        outputs = learn(field, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
+        return *outputs, dr.count(records.valid), n_bad
 
     def start(self, scene, sensor) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
-        with dr.suspend_grad():
-            records, _ = self._probe(scene, sensor, mi.UInt32(self._seed(0xFFFFFF)))
+        with dr.suspend_grad(), undisturbed():
+            probe = self._probe if self.freezes(sensor) else self._probe_plain
+            records, _ = probe(scene, sensor, mi.UInt32(self._seed(0xFFFFFF)))
             valid = np.array(records.valid)
             points = np.array(records.position).T[valid]
             target = np.array(records.target).T[valid].mean(axis=-1)
@@ -191,7 +202,7 @@ class IncidentCache:
         if target.size:
             scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-30):
-            scale = 1.0  # no indirect light found: the cache will learn 0
+            scale = 1e-20  # no indirect light found: the cache answers with nothing
         self.field = Field(low, high, self.shape, scale=scale, seed=self.seed)
         dr.eval(self.field)
 
@@ -204,31 +215,39 @@ class IncidentCache:
             self._good = self.field.snapshot()
         training = self.training
         rate = training.rate(self.steps) * self.rate_factor
-        outputs = self._frame(
-            scene, sensor, self.field, mi.UInt32(self._seed(self.steps)),
-            dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
-        )  # fmt: skip
-        value, _, n_valid, n_bad = (v[0] for v in outputs)
+        frame = self._frame if self.freezes(sensor) else self._frame_plain
+        with undisturbed():
+            outputs = frame(
+                scene, sensor, self.field, mi.UInt32(self._seed(self.steps)),
+                dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
+            )  # fmt: skip
+        value, mean_target, mean_prediction, n_valid, n_bad = (v[0] for v in outputs)
         self.steps += 1
         self.field.steps = self.steps
         s = self.statistics
         s["steps"], s["loss"] = self.steps, value
         s["records"] += int(n_valid)
         s["nonfinite"] += int(n_bad)
-        self._watch(value)
+        self._watch(value, mean_target, mean_prediction)
+        if mean_target > self.BRIGHTER:  # the light is another: constants that were measured in the old one are void
+            mi.Log(mi.LogLevel.Info, "mi_neural: the scene became brighter by far; the cache starts anew")
+            self.field, self._good = None, None
         s["seconds_train"] += time.perf_counter() - t0
         return value
 
     def _seed(self, step: int) -> int:
         return int(np.random.SeedSequence((self.seed, 0xCAC4E, step)).generate_state(1)[0])
 
-    def _watch(self, value: float) -> None:
-        """Divergence: a loss that is not finite, or far above what it has been."""
-        typical = float(np.median(self.losses)) if len(self.losses) >= 8 else math.inf
-        if not math.isfinite(value) or (typical > 0 and value > self.EXPLOSION * max(typical, 1e-6)):
+    def _watch(self, value: float, mean_target: float, mean_prediction: float) -> None:
+        """Divergence: numbers that are not finite, or predictions far above all targets.
+
+        The loss itself is no sign: it is relative to the cache's own mean, so it stays small when the cache explodes,
+        and single batches of healthy training exceed the median a thousandfold.
+        """
+        limit = self.EXPLOSION * max(1.0, mean_target, float(self.field.mean[0]))
+        if not (math.isfinite(value) and math.isfinite(mean_prediction)) or mean_prediction > limit:
             self.recover()
             return
-        self.losses.append(value)
         self.history.append(value)
         if self.steps % self.SNAPSHOT_EVERY == 0:
             weights = self.field.snapshot()
@@ -239,7 +258,6 @@ class IncidentCache:
         """Go back to the last good weights, with half the learning rate."""
         self.field.restore(self._good)
         self.rate_factor *= 0.5
-        self.losses.clear()
         self.statistics["recoveries"] += 1
         mi.Log(
             mi.LogLevel.Warn,
@@ -254,7 +272,7 @@ class IncidentCache:
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
             None if self.field is None else (self.field.snapshot(), mi.Float(self.field.mean)),
-            self.steps, self.rate_factor, list(self.losses), list(self.history), self._good, dict(self.statistics),
+            self.steps, self.rate_factor, list(self.history), self._good, dict(self.statistics),
         )  # fmt: skip
 
     def rollback(self, state) -> None:
@@ -265,8 +283,7 @@ class IncidentCache:
             field.reset()
             self.field = field
             return
-        weights, self.steps, self.rate_factor, losses, self.history, self._good, self.statistics = state
-        self.losses = deque(losses, maxlen=self.WINDOW)
+        weights, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
         if weights is not None:
             self.field.restore(weights[0])
             self.field.mean = weights[1]

@@ -10,6 +10,9 @@ import mitsuba as mi
 
 from . import vertex
 
+#: Delta surfaces that the end of a training path is followed through.
+MAX_CHAIN = 16
+
 
 @dataclass
 class TrainingRecords:
@@ -103,13 +106,32 @@ def trace_training_paths(
     )  # fmt: skip
     _, ray, p_prev, n_prev, pdf, delta, active, sampler = state
 
-    # The last vertex
+    # The last vertex; if it is a mirror or glass, the one that is seen through it
     si, E_next = arrive(ray, p_prev, n_prev, pdf, delta, active)
+
+    def is_delta(si, active):
+        return active & si.is_valid() & ~vertex.has_smooth(si.bsdf())
+
+    def look_through(k, ray, β, R, chain, sampler):
+        si = scene.ray_intersect(ray, chain)
+        bs, weight = si.bsdf().sample(ctx, si, sampler.next_1d(), sampler.next_2d(), chain)
+        β = dr.select(chain, vertex.finite(β * weight, chain), β)
+        ray = dr.select(chain, si.spawn_ray(si.to_world(bs.wo)), ray)
+        si = scene.ray_intersect(ray, chain)
+        R += dr.select(chain, β * vertex.emission(scene, si, chain), 0)
+        return k + 1, ray, β, R, is_delta(si, chain) & (dr.max(β) > 0), sampler
+
+    chain = is_delta(si, active)
+    _, ray, β, R, _, sampler = dr.while_loop(
+        (mi.UInt32(0), mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Bool(chain), sampler),
+        lambda k, ray, β, R, chain, sampler: chain & (k < MAX_CHAIN), look_through, label="delta chain",
+    )  # fmt: skip
+    si = dr.select(chain, scene.ray_intersect(ray, chain), si)
     active &= si.is_valid()
     bsdf = si.bsdf(ray)
     smooth = active & vertex.has_smooth(bsdf)
-    R = vertex.direct_light(scene, si, bsdf, sampler.next_2d(), smooth, alone=True)
-    R += dr.select(smooth, tail(si, bsdf, smooth, sampler), 0)
+    L_nee = vertex.direct_light(scene, si, bsdf, sampler.next_2d(), smooth, alone=True)
+    R += dr.select(smooth, β * (L_nee + tail(si, bsdf, smooth, sampler)), 0)
 
     # Back to front. A path that ended early carries zeros from there on; its last vertex' emission is in E.
     dr.eval(E, N, f, E_next, R, records)
