@@ -165,6 +165,7 @@ class IncidentCache:
         self.steps = 0
         self.rate_factor = 1.0
         self.history: list[float] = []
+        self.levels: list[float] = []  # latest mean targets, over the field's scale
         self._good: dict[str, np.ndarray] | None = None
         self.statistics = {
             "steps": 0, "records": 0, "nonfinite": 0, "recoveries": 0, "seconds_train": 0.0, "loss": math.nan,
@@ -229,7 +230,7 @@ class IncidentCache:
         s["records"] += int(n_valid)
         s["nonfinite"] += int(n_bad)
         self._watch(value, mean_target, mean_prediction)
-        if mean_target > self.BRIGHTER:  # the light is another: constants that were measured in the old one are void
+        if mean_target > max(self.BRIGHTER, 10 * mean_prediction):  # another light: what was measured in the old is void
             mi.Log(mi.LogLevel.Info, "mi_neural: the scene became brighter by far; the cache starts anew")
             self.field, self._good = None, None
         s["seconds_train"] += time.perf_counter() - t0
@@ -239,16 +240,17 @@ class IncidentCache:
         return int(np.random.SeedSequence((self.seed, 0xCAC4E, step)).generate_state(1)[0])
 
     def _watch(self, value: float, mean_target: float, mean_prediction: float) -> None:
-        """Divergence: numbers that are not finite, or predictions far above all targets.
+        """Divergence: numbers that are not finite, or predictions far above what targets have been.
 
         The loss itself is no sign: it is relative to the cache's own mean, so it stays small when the cache explodes,
         and single batches of healthy training exceed the median a thousandfold.
         """
-        limit = self.EXPLOSION * max(1.0, mean_target, float(self.field.mean[0]))
+        limit = self.EXPLOSION * max(1.0, float(np.median(self.levels)) if self.levels else 1.0)
         if not (math.isfinite(value) and math.isfinite(mean_prediction)) or mean_prediction > limit:
             self.recover()
             return
         self.history.append(value)
+        self.levels = [*self.levels[-31:], mean_target]
         if self.steps % self.SNAPSHOT_EVERY == 0:
             weights = self.field.snapshot()
             if all(np.isfinite(w).all() for w in weights.values()):
@@ -287,6 +289,7 @@ class IncidentCache:
         if weights is not None:
             self.field.restore(weights[0])
             self.field.mean = weights[1]
+            self.levels = []
             self.field.steps = self.steps
 
     def settled(self) -> bool:
