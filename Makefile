@@ -27,11 +27,9 @@ demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EX
 	    --reference scenes/ajar_door_320x180.exr -o out/demo
 	@echo "Open out/demo/report.html"
 
-picture: $(STAMP)  ## the README's picture
-	$(BIN)/mi-neural compare ajar_door -i path -i nirc --size 480x270 --steady 300 --frame-seconds 1 --denoise \
-	    --reference-spp 64 -o out/picture
+picture: demo  ## the README's picture, of the demo's frames
 	$(BIN)/python -m mi_neural.measure.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
-	    out/picture/path_$(k) out/picture/nirc_$(k))
+	    out/demo/path_$(k) out/demo/nirc_$(k))
 
 test: $(STAMP)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest
