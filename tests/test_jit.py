@@ -68,22 +68,22 @@ def test_no_kernel_is_compiled_and_no_byte_kept_over_forty_frames(sphere, runnin
         dr.sync_thread()
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096  # resident
 
+    memory()  # scenes of earlier tests go now: Dr.Jit records anew when their surfaces leave its registry
+    counts = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):  # the flag is part of what is frozen
-        for k in range(10):
-            render(sphere, running, 2, k)
-        start = memory()
-        counts = []
-        for k in range(40):
+        for k in range(70):  # the first thirty, with the snapshot of the weights among them, settle
+            if k == 30:
+                start = memory()
             dr.kernel_history_clear()
             render(sphere, running, 2, 200 + k)
             history = [h for h in dr.kernel_history() if h["type"] == dr.KernelType.JIT]
-            compiled = [h for h in history if not h["cache_hit"]]
-            assert not compiled, f"frame {k}: compiled {compiled}"
+            compiled = sum(not h["cache_hit"] for h in history)
+            assert k < 30 or compiled == 0, f"frame {k}: {compiled} kernels compiled"
             counts.append(len(history))
         dr.kernel_history_clear()
     grown = memory() - start
-    print(f"kernels per frame {counts[0]}..{counts[-1]}, memory grown by {grown / 2**20:.1f} MiB")
-    assert max(counts) <= min(counts) + 4  # a snapshot of the weights now and then
+    print(f"kernels per frame {min(counts[30:])}..{max(counts[30:])}, memory grown by {grown / 2**20:.1f} MiB")
+    assert len(set(counts[30:])) <= 2  # with and without a snapshot of the weights
     assert grown < 24 * 2**20
 
 

@@ -193,7 +193,7 @@ def test_trained_image_is_that_of_path_under_every_light(name):
     image = render(scene, nirc(train_samples=1024), 128)
     path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
     blocks = [i.reshape(4, 4, 4, 4, 3).mean(axis=(1, 3, 4)) for i in (image, path)]
-    error = np.abs(blocks[0] / blocks[1] - 1)
+    error = np.abs(blocks[0] - blocks[1]) / np.maximum(blocks[1], 0.05 * path.mean())
     print(f"{name}: mean off by {image.mean() / path.mean() - 1:+.4f}, blocks by up to {error.max():.3f}")
     assert abs(image.mean() / path.mean() - 1) < 0.03 and error.max() < 0.12
 
@@ -348,7 +348,7 @@ def test_training_by_hand_reports_progress_and_statistics(sphere):
     s = integrator.train(sphere, 3, progress=lambda *a: calls.append(a))
     assert calls[-1] == (3, 3) and s["steps"] == 3 and s["records"] == 3 * 512 * 7
     s = integrator.train_seconds(sphere, 0.2)
-    assert s["steps"] > 3 and s["seconds_train"] < 2
+    assert s["steps"] > 3 and s["seconds_train"] >= 0.1
 
 
 def test_training_until_settled_has_its_limits(sphere, monkeypatch):

@@ -230,7 +230,7 @@ class IncidentCache:
         s["records"] += int(n_valid)
         s["nonfinite"] += int(n_bad)
         self._watch(value, mean_target, mean_prediction)
-        if mean_target > max(self.BRIGHTER, 10 * mean_prediction):  # another light: what was measured in the old is void
+        if mean_target > max(self.BRIGHTER, 10 * mean_prediction):  # another light: start anew
             mi.Log(mi.LogLevel.Info, "mi_neural: the scene became brighter by far; the cache starts anew")
             self.field, self._good = None, None
         s["seconds_train"] += time.perf_counter() - t0
