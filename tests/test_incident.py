@@ -184,7 +184,7 @@ def test_training_converges_to_the_known_light(cube, trained):
     found = answers(trained, *cube)
     rms = np.sqrt(np.mean((found - 0.5) ** 2))
     print(f"mean {found.mean():.4f} (known 0.5), rms error {rms:.4f}")
-    assert abs(found.mean() - 0.5) < 0.02 and rms < 0.03  # training noise over seeds: about 0.006
+    assert abs(found.mean() - 0.5) < 0.02 and rms < 0.03
 
 
 def test_training_converges_in_the_sphere():
