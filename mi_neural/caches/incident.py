@@ -145,8 +145,9 @@ class IncidentCache:
     `statistics` counts since the start: records, steps, non-finite targets, recoveries, seconds of training.
     """
 
-    #: Mean predictions this many times the mean target are an explosion.
-    EXPLOSION = 50.0
+    #: Mean predictions this many times the latest mean targets are an explosion. Healthy training stayed below 1.3 in
+    #: seven scenes from their first step on (1024 paths, 200 steps); all weights times 100 give 10^5.
+    EXPLOSION = 10.0
     #: Targets this many times the brightness that the field was made for: it is made anew.
     BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
@@ -226,35 +227,41 @@ class IncidentCache:
         self.steps += 1
         self.field.steps = self.steps
         s = self.statistics
-        s["steps"], s["loss"] = self.steps, value
+        s["steps"] += 1
+        s["loss"] = value
         s["records"] += int(n_valid)
         s["nonfinite"] += int(n_bad)
-        self._watch(value, mean_target, mean_prediction)
-        if mean_target > max(self.BRIGHTER, 10 * mean_prediction):  # another light: start anew
+        healthy = self._watch(value, mean_target, mean_prediction)
+        if healthy and mean_target > max(self.BRIGHTER, 10 * mean_prediction):
+            # Another light: what was measured in the old one is void, and the schedule of rates begins anew
             mi.Log(mi.LogLevel.Info, "mi_neural: the scene became brighter by far; the cache starts anew")
-            self.field, self._good = None, None
+            statistics = self.statistics
+            self.reset()
+            self.statistics = s = statistics
         s["seconds_train"] += time.perf_counter() - t0
         return value
 
     def _seed(self, step: int) -> int:
         return int(np.random.SeedSequence((self.seed, 0xCAC4E, step)).generate_state(1)[0])
 
-    def _watch(self, value: float, mean_target: float, mean_prediction: float) -> None:
-        """Divergence: numbers that are not finite, or predictions far above what targets have been.
+    def _watch(self, value: float, mean_target: float, mean_prediction: float) -> bool:
+        """Whether training is healthy; if not, it is undone.
 
-        The loss itself is no sign: it is relative to the cache's own mean, so it stays small when the cache explodes,
-        and single batches of healthy training exceed the median a thousandfold.
+        Divergence: numbers that are not finite, or predictions far above what targets have been. The loss itself is no
+        sign: it is relative to the cache's own mean, so it stays small when the cache explodes, and single batches of
+        healthy training exceed the median a thousandfold.
         """
         limit = self.EXPLOSION * max(1.0, float(np.median(self.levels)) if self.levels else 1.0)
         if not (math.isfinite(value) and math.isfinite(mean_prediction)) or mean_prediction > limit:
             self.recover()
-            return
+            return False
         self.history.append(value)
         self.levels = [*self.levels[-31:], mean_target]
         if self.steps % self.SNAPSHOT_EVERY == 0:
             weights = self.field.snapshot()
             if all(np.isfinite(w).all() for w in weights.values()):
                 self._good = weights
+        return True
 
     def recover(self) -> None:
         """Go back to the last good weights, with half the learning rate."""
