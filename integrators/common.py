@@ -68,10 +68,33 @@ SHARED_KEYS = """
      * - hidden_layers
        - |int|
        - Their number. (Default: 2)
+     * - light_sampler
+       - |emitter|
+       - Nested plugin that chooses the light of each shadow ray, also in training: ``uniform_lights``,
+         ``power_lights``, ``nvc_lights``. (Default: the scene's own choice, as in ``path``)
      * - channels
        - |string|
        - Extra channels to write, a comma-separated list; the plugin says which. (Default: none)
 """
+
+
+LIGHT_SAMPLER_KEY = """
+     * - light_sampler
+       - |emitter|
+       - Nested plugin that chooses the light of each shadow ray: ``uniform_lights``, ``power_lights``, ``nvc_lights``.
+         (Default: the scene's own choice, as in ``path``)
+"""
+
+
+def light_sampler_of(props):
+    """The nested light sampler of a plugin's properties, None without one. Raises ValueError for anything else."""
+    given = props.get("light_sampler", None)
+    if given is not None and not hasattr(given, "lights"):
+        raise ValueError(
+            f"{props.plugin_name()}: light_sampler is not a light sampler; nest one, for example "
+            '<emitter type="nvc_lights" name="light_sampler"/>'
+        )
+    return given
 
 
 def scene_signature(scene) -> str:
@@ -135,6 +158,7 @@ class _State:
     def reset(self) -> None:
         self.scene_key = self.signature = None
         self.loaded: tuple | None = None  # file and scene of a cache that was read
+        self.lights = None  # what chooses lights now; None: the scene itself
         self.images = 0
         self.queries = 0.0
         self.nonfinite: list = []
@@ -184,6 +208,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         for n in names:
             self._check(n in self.CHANNELS, f"unknown channel '{n}'; it has: {', '.join(self.CHANNELS)}")
         self.channels = names
+        self.light_sampler = light_sampler_of(props)
 
         self.cache = IncidentCache(training, shape, seed=self.seed)
         self.state = _State()
@@ -196,9 +221,9 @@ class CacheIntegrator(mi.SamplingIntegrator):
     # -------------------------------------------------------------------------------------------------------------
     # To be given by the plugin
 
-    def estimate(self, scene, field, sampler, ray, mixture, active):
-        """Radiance along camera rays: (L, valid, {channel: value})."""
-        raise NotImplementedError
+    def estimate(self, scene, lights, field, sampler, ray, mixture, active):
+        """Radiance along camera rays: (L, valid, {channel: value}). `lights` chooses lights; None: the scene itself."""
+        raise NotImplementedError(f"{type(self).__name__} must define estimate()")
 
     def settle(self, scene, sensor) -> None:
         """Measure, once per scene, what settings depend on; results go to ``state.facts``."""
@@ -223,6 +248,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Forget what was learned; the next image trains anew. Compiled kernels are kept."""
         self.cache.reset()
         self.state.reset()
+        if self.light_sampler is not None:
+            self.light_sampler.reset()
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
@@ -238,13 +265,18 @@ class CacheIntegrator(mi.SamplingIntegrator):
             self.state.scene_key, self.state.signature = key, signature
         if key != self.state.facts_key:
             self.state.facts, self.state.facts_key = {}, key
+        if self.light_sampler is not None:
+            # An image that is rendered in several calls is one frame; settings are measured with what was learned at
+            # least once
+            with dr.suspend_grad():
+                self.state.lights = self.light_sampler.lights(scene, sensor, train=train and not self.state.image_open)
         if not self.needs_cache:
             if not self.state.facts:
                 self.settle(scene, sensor)
             return
         with dr.resume_grad():
             if self.cache.field is None:
-                self.cache.start(scene, sensor)
+                self.cache.start(scene, sensor, self.state.lights)
             if not self.state.facts:
                 with dr.suspend_grad():
                     self.settle(scene, sensor)
@@ -252,11 +284,11 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 if self.state.images == 0 and self.cache.steps == 0:
                     self._train_first(scene, sensor)
                 else:
-                    self.cache.train(scene, sensor, frames=self.train_steps)
+                    self.cache.train(scene, sensor, self.state.lights, frames=self.train_steps)
 
     def _train_first(self, scene, sensor, progress=None) -> None:
         auto = self.train_frames < 0
-        self.cache.train(scene, sensor, frames=None if auto else self.train_frames,
+        self.cache.train(scene, sensor, self.state.lights, frames=None if auto else self.train_frames,
                          at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1], progress=progress)  # fmt: skip
 
     def train_first(self, scene, sensor=0, progress=None) -> dict:
@@ -272,7 +304,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         sensor = self._sensor(scene, sensor)
         self._ready(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
-            self.cache.train(scene, sensor, frames=frames, progress=progress)
+            self.cache.train(scene, sensor, self.state.lights, frames=frames, progress=progress)
         return self.statistics()
 
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
@@ -280,7 +312,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         sensor = self._sensor(scene, sensor)
         self._ready(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
-            self.cache.train(scene, sensor, seconds=seconds, progress=progress)
+            self.cache.train(scene, sensor, self.state.lights, seconds=seconds, progress=progress)
         return self.statistics()
 
     def train_fraction(self, seconds: float) -> float:
@@ -303,7 +335,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             state = None if untouched else self.cache.checkpoint()
             if not self.freeze_cache:
                 for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
-                    self.cache.train_frame(scene, sensor)
+                    self.cache.train_frame(scene, sensor, self.state.lights)
         with dr.suspend_grad():
             for _ in range(2):
                 dr.eval(self._render(scene, sensor, 1, spp))
@@ -321,6 +353,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         s["queries"] = int(self.state.queries)
         s["images"] = self.state.images
         s.update(self.state.facts)
+        if self.light_sampler is not None:
+            s.update(self.light_sampler.statistics())
         if self.cache.field is not None:
             s["parameters"] = sum(int(np.prod(v.shape)) for v in self.cache.field.averaged.parameters().values())
             s["scale"] = float(self.cache.field.scale[0])
@@ -443,8 +477,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
                     )
                 with undisturbed():
                     pos, values, n_bad = self.state.passes[key](
-                        scene, sensor, field, mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, done),
-                        dr.opaque(mi.UInt32, y), mixture,
+                        scene, sensor, self.state.lights, field, mi.UInt32(seed & 0xFFFFFFFF),
+                        dr.opaque(mi.UInt32, done), dr.opaque(mi.UInt32, y), mixture,
                     )  # fmt: skip
                 self.state.nonfinite.append(n_bad)
                 block.set_coalesce(False)
@@ -459,7 +493,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def _frozen_pass(self, width: int, n_rows: int, spp: int, border: int, box: bool, freeze: bool):
         """A function that renders `spp` samples of some rows and returns what the film's block takes."""
 
-        def render_pass(scene, sensor, field, seed, first_sample, first_row, mixture):
+        def render_pass(scene, sensor, lights, field, seed, first_sample, first_row, mixture):
             n = width * n_rows * spp
             lane = dr.arange(mi.UInt32, n)
             pixel = lane // spp + first_row * width
@@ -479,7 +513,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), pos_unit, aperture)
             ray.scale_differential(dr.rsqrt(mi.Float(spp)))
 
-            L, valid, extra = self.estimate(scene, field, sampler, ray, mixture, mi.Bool(True))
+            L, valid, extra = self.estimate(scene, lights, field, sampler, ray, mixture, mi.Bool(True))
             L *= weight
             ok = dr.all(dr.isfinite(L))
             L = dr.select(ok, L, 0)
@@ -510,7 +544,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         lane = mi.UInt32(sampler.next_1d() * 2**24)
         own = PathSampler.make(lane, mi.UInt32(sampler.next_1d() * 2**24))
         mixture = mi.Float(self.mixture(self.state.planned_spp or sampler.sample_count()))
-        L, valid, extra = self.estimate(scene, self.cache.field, own, ray, mixture, mi.Bool(active))
+        L, valid, extra = self.estimate(scene, self.state.lights, self.cache.field, own, ray, mixture, mi.Bool(active))
         aovs = []
         for name in self.channels:
             aovs += list(extra[name]) if self.CHANNELS[name] == 3 else [extra[name]]

@@ -13,7 +13,7 @@ TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
 #: the cache's directional detail does not suffice for it.
 SHARP_PDF = 3.0
 #: Dimensions of the stratified numbers
-AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE = range(6)
+AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE, LIGHT = range(7)
 
 
 class NIRCIntegrator(CacheIntegrator):
@@ -49,7 +49,7 @@ class NIRCIntegrator(CacheIntegrator):
         """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene."""
         if self.light_samples > 0:
             return
-        n = 2**14
+        n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(AA), mi.Point2f(0.5))
@@ -58,10 +58,12 @@ class NIRCIntegrator(CacheIntegrator):
 
         def once(k, mean, square, sampler):
             bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-            next_ray = si.spawn_ray(si.to_world(bs.wo))
             delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            Le = vertex.emission_mis(scene, scene.ray_intersect(next_ray, active), si.p, si.n, bs.pdf, delta, active)
-            direct = vertex.direct_light(scene, si, bsdf, sampler.next_2d(), active)
+            si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active)
+            direct, Le = vertex.emitted(
+                scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
+                active,
+            )  # fmt: skip
             direct = dr.mean(vertex.finite(β * (direct + vertex.finite(weight * Le, active)), active))
             return k + 1, mean + 0.25 * direct, square + 0.25 * dr.square(direct), sampler
 
@@ -86,7 +88,7 @@ class NIRCIntegrator(CacheIntegrator):
 
     # -------------------------------------------------------------------------------------------------------------
 
-    def estimate(self, scene, field, sampler, ray, mixture, active):
+    def estimate(self, scene, lights, field, sampler, ray, mixture, active):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
         L, β, ray, si, depth, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
         bsdf = si.bsdf(ray)
@@ -101,9 +103,6 @@ class NIRCIntegrator(CacheIntegrator):
         state = (mi.UInt32(0), mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero), sampler)
 
         def traced_sample(i, direct, cache, residual, sampler):
-            # ---------------------- Direct light ----------------------
-            direct += vertex.direct_light(scene, si, bsdf, sampler.stratified_2d(NEE, n_light, i), active)
-
             # ------------------- One BSDF sample ----------------------
             bs, weight = bsdf.sample(
                 mi.BSDFContext(), si, sampler.stratified_1d(LOBE, n_light, i),
@@ -121,10 +120,13 @@ class NIRCIntegrator(CacheIntegrator):
                 Li_cache = dr.select(alive & ~delta, weight * field.query(features, wo), 0)
                 cache += Li_cache
 
-            # --------------- What is there: emission ------------------
+            # ---- Direct light: by next-event estimation, and what is there
             si_next = scene.ray_intersect(next_ray, alive)
-            Le = vertex.emission_mis(scene, si_next, si.p, si.n, bs.pdf, delta, alive)
-            direct += weight * Le
+            L_nee, Le = vertex.emitted(
+                scene, lights, si, bsdf, sampler.stratified_1d(LIGHT, n_light, i),
+                sampler.stratified_2d(NEE, n_light, i), sampler, active, si_next, bs.pdf, delta, alive,
+            )  # fmt: skip
+            direct += L_nee + weight * Le
 
             # --------------- What is there: reflection ----------------
             spread = dr.select(
@@ -134,7 +136,7 @@ class NIRCIntegrator(CacheIntegrator):
             share = self.gather_share(delta, bs.pdf, spread, a_0, far) if cached else mi.Float(1)
             follow = alive & (share > 0) & si_next.is_valid()
             Li, sampler = self.gather(
-                scene, field, sampler, next_ray, si_next, depth + 1, weight, bs, spread, a_0, follow
+                scene, lights, field, sampler, next_ray, si_next, depth + 1, weight, bs, spread, a_0, follow
             )
             residual += dr.select(alive, share * (Li - Li_cache), 0)
             return i + 1, direct, cache, residual, sampler
@@ -234,7 +236,7 @@ class NIRCIntegrator(CacheIntegrator):
             share = 1 - termination.balanced_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)
 
-    def gather(self, scene, field, sampler, ray, si, depth, β, bs, spread, a_0, active):
+    def gather(self, scene, lights, field, sampler, ray, si, depth, β, bs, spread, a_0, active):
         """Light that `si`, `depth` segments from the camera, reflects back along `ray`, times β.
 
         Next-event estimation there, the rest from the cache at the first vertex where the path is wide enough, by path
@@ -250,33 +252,32 @@ class NIRCIntegrator(CacheIntegrator):
             smooth = active & vertex.has_smooth(bsdf)
             wide = smooth & termination.exceeds(spread, a_0, self.spread_threshold) if cached else mi.Bool(False)
 
-            # Direct light; with a BSDF ray to share the work only where one will be followed
-            ds, w_emitter = scene.sample_emitter_direction(si, sampler.next_2d(), True, smooth)
-            f, pdf_bsdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth & (ds.pdf > 0))
-            w_mis = dr.select(ds.delta | (wide & (pdf_bsdf <= SHARP_PDF)), 1, vertex.mis_weight(ds.pdf, pdf_bsdf))
-            L += β * vertex.finite(f * w_emitter * w_mis, smooth & (ds.pdf > 0))
-
             # One more direction: ask the cache for its light, or follow it
             bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
             delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             wo = si.to_world(bs.wo)
-            β = vertex.finite(β * weight, active)
+            β_next = vertex.finite(β * weight, active)
             stop = wide & ~delta & (bs.pdf <= SHARP_PDF)
             if cached:
-                L += dr.select(stop, β * field.query(field.encode(si.p), wo), 0)
+                L += dr.select(stop, β_next * field.query(field.encode(si.p), wo), 0)
             η *= bs.eta
             depth += 1
-            active &= ~stop & (dr.max(β) > 0)
+            followed = active & ~stop & (dr.max(β_next) > 0)
             roulette = depth >= self.rr_depth
-            q = dr.minimum(dr.max(β) * η**2, 0.95)
-            active &= ~roulette | (sampler.next_1d() < q)
-            β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
+            q = dr.minimum(dr.max(β_next) * η**2, 0.95)
+            followed &= ~roulette | (sampler.next_1d() < q)
+            β_next = dr.select(roulette, β_next * dr.rcp(dr.maximum(q, 1e-6)), β_next)
 
-            # Emission that the followed ray meets
+            # Direct light; next-event estimation shares the work only with rays that are followed
             next_ray = si.spawn_ray(wo)
-            si_next = scene.ray_intersect(next_ray, active)
-            L += β * vertex.emission_mis(scene, si_next, si.p, si.n, bs.pdf, delta, active)
-            active &= si_next.is_valid() & (depth < max_depth)
+            si_next = scene.ray_intersect(next_ray, followed)
+            L_nee, Le = vertex.emitted(
+                scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
+                followed, alone=lambda pdf: wide & (pdf <= SHARP_PDF),
+            )  # fmt: skip
+            L += β * L_nee + β_next * Le
+            β = β_next
+            active = followed & si_next.is_valid() & (depth < max_depth)
             spread += dr.select(
                 delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
             )

@@ -3,11 +3,13 @@
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural.integrators.common import LIGHT_SAMPLER_KEY, light_sampler_of
 from mi_neural.transport import vertex
 
 
 class PlainPathIntegrator(mi.SamplingIntegrator):
-    r"""
+    __doc__ = (
+        r"""
     .. _integrator-plain_path:
 
     Plain path tracer (:monosp:`plain_path`)
@@ -31,7 +33,9 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
      * - hide_emitters
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
-
+    """
+        + LIGHT_SAMPLER_KEY
+        + r"""
     *Works with* all surfaces and emitters of Mitsuba. *Leaves out* participating media (use ``volpath``), polarization.
 
     .. tabs::
@@ -43,6 +47,7 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
 
             mi.load_dict({"type": "plain_path", "max_depth": 8})
     """
+    )
 
     def __init__(self, props):
         super().__init__(props)
@@ -54,52 +59,76 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
         if self.rr_depth < 1:
             raise ValueError(f"plain_path: rr_depth is {self.rr_depth}; it must be at least 1")
 
+        self.light_sampler = light_sampler_of(props)
+        self.lights, self.entered = None, False
+
+    def prepare_lights(self, scene, sensor, train: bool = True) -> None:
+        """Have lights chosen as they are in `scene` now."""
+        if self.light_sampler is not None:
+            self.lights = self.light_sampler.lights(scene, sensor, train)
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        if self.entered:  # Mitsuba's own render() comes back here once
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+        self.entered = True
+        try:
+            self.prepare_lights(scene, sensor)
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+        finally:
+            self.entered = False
+
     @dr.syntax
     def sample(self, scene, sampler, ray, medium=None, active=True):
         max_depth = mi.UInt32(self.max_depth if self.max_depth >= 0 else 0xFFFFFFFF)
         bsdf_ctx = mi.BSDFContext()
-        hide = mi.Bool(self.hide)
 
         ray = mi.Ray3f(dr.detach(ray))
         L = mi.Spectrum(0)  # Radiance so far
         β = mi.Spectrum(1)  # Throughput
         η = mi.Float(1)  # Relative index of refraction along the path
         depth = mi.UInt32(0)
-        p_prev, n_prev = mi.Point3f(ray.o), mi.Normal3f(0, 0, 1)  # Where the ray comes from,
-        pdf_prev, delta_prev = mi.Float(1), mi.Bool(True)  # and how it was sampled
         active = mi.Bool(active) & (max_depth > 0)
-        valid = mi.Bool(False)
 
-        while active:
-            pi = scene.ray_intersect_preliminary(ray, active=active)
-            if dr.hint(self.hide, mode="scalar"):  # look through emitters that the camera sees
-                first = active & (depth == 0)
-                pi = dr.select(first, self.skip_area_emitters(scene, ray, True, first), pi)
+        # What the camera sees
+        if dr.hint(self.hide, mode="scalar"):
+            pi = self.skip_area_emitters(scene, ray, True, active)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            seen = (depth > 0) | ~hide
-            L += β * vertex.emission_mis(scene, si, p_prev, n_prev, pdf_prev, delta_prev, active & seen)
-            valid |= active & seen & (si.is_valid() | (si.emitter(scene, active) != None))  # noqa: E711
-            active &= si.is_valid() & (depth + 1 < max_depth)
+            valid = active & si.is_valid()
+        else:
+            si = scene.ray_intersect(ray, active)
+            L += vertex.emission(scene, si, active)
+            valid = active & (si.is_valid() | (si.emitter(scene, active) != None))  # noqa: E711
+        active &= si.is_valid() & (depth + 1 < max_depth)
 
-            # Direct light by next-event estimation
-            bsdf = si.bsdf(ray)
-            smooth = active & vertex.has_smooth(bsdf)
-            L += β * vertex.direct_light(scene, si, bsdf, sampler.next_2d(), smooth)
-
+        while dr.hint(active, exclude=[self]):
             # Go on in a direction that the BSDF chooses
+            bsdf = si.bsdf(ray)
             bs, weight = bsdf.sample(bsdf_ctx, si, sampler.next_1d(), sampler.next_2d(), active)
-            β = vertex.finite(β * weight, active)
-            η *= bs.eta
-            p_prev, n_prev = mi.Point3f(si.p), mi.Normal3f(si.n)
-            pdf_prev, delta_prev = mi.Float(bs.pdf), mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            weight = vertex.finite(weight, active)
+            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             ray = si.spawn_ray(si.to_world(bs.wo))
+            si_next = scene.ray_intersect(ray, active & (dr.max(weight) > 0))
+
+            # Direct light: by next-event estimation, and what that direction met
+            followed = active & (dr.max(weight) > 0)
+            L_nee, Le = vertex.emitted(
+                scene, self.lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf,
+                delta, followed,
+            )  # fmt: skip
+            L += β * (L_nee + weight * Le)
+
+            β *= weight
+            η *= bs.eta
             depth += 1
+            active = followed & si_next.is_valid() & (depth + 1 < max_depth)
 
             # Russian roulette (must cancel out η² to obtain unitless throughput)
             q = dr.minimum(dr.max(β) * η**2, 0.95)
             roulette = depth >= self.rr_depth
             active &= (dr.max(β) > 0) & (~roulette | (sampler.next_1d() < q))
             β[roulette] *= dr.rcp(dr.maximum(q, 1e-6))
+            si = si_next
 
         return L, valid, []
 

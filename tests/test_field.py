@@ -279,7 +279,7 @@ def test_losses_are_their_formulas(rng):
 
 @pytest.mark.parametrize("key, value", [
     ("n_levels", 0), ("n_features", 0), ("hashmap_size", 0), ("base_resolution", 0), ("width", 0), ("n_hidden", 0),
-    ("n_outputs", 0), ("width", -4), ("per_level_scale", 1.0), ("direction_degree", -1), ("direction_degree", 8),
+    ("n_outputs", 0), ("width", -4), ("per_level_scale", 1.0), ("direction_degree", -2), ("direction_degree", 8),
     ("hashmap_size", 33),
 ])  # fmt: skip
 def test_impossible_shape_is_refused_by_name(key, value):

@@ -31,9 +31,10 @@ class FieldShape:
     hashmap_size          most entries of one level
     base_resolution       cells along an axis on the coarsest level
     per_level_scale       factor from level to level
-    direction_degree      of the spherical harmonics of the direction
-    width, n_hidden       of the MLP (ReLU)
+    direction_degree      of the spherical harmonics of the direction; -1: the field depends on the position alone
+    width, n_hidden       of the MLP
     n_outputs             values per query
+    leak                  slope of its rectifiers below 0
     """
 
     n_levels: int = 8
@@ -45,6 +46,7 @@ class FieldShape:
     width: int = 32
     n_hidden: int = 2
     n_outputs: int = 3
+    leak: float = 0.0
 
     def __post_init__(self):
         for name in ("n_levels", "n_features", "hashmap_size", "base_resolution", "width", "n_hidden", "n_outputs"):
@@ -52,8 +54,8 @@ class FieldShape:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
         if self.per_level_scale <= 1:
             raise ValueError(f"per_level_scale is {self.per_level_scale}; it must be greater than 1")
-        if not 0 <= self.direction_degree <= 7:
-            raise ValueError(f"direction_degree is {self.direction_degree}; it must lie in 0..7")
+        if not -1 <= self.direction_degree <= 7:
+            raise ValueError(f"direction_degree is {self.direction_degree}; it must lie in -1..7")
         if self.hashmap_size % self.n_features:
             raise ValueError(f"hashmap_size ({self.hashmap_size}) must be a multiple of n_features ({self.n_features})")
 
@@ -62,7 +64,7 @@ class FieldShape:
         return self.n_levels * self.n_features + (self.direction_degree + 1) ** 2
 
 
-def _own(value):
+def own_copy(value):
     """An evaluated, detached copy in memory of its own: not shared with another variable or with NumPy (such memory
     must not be freed while a function is being frozen)."""
     copy = dr.detach(value) + dr.opaque(mi.Float, 0)
@@ -70,7 +72,7 @@ def _own(value):
     return copy
 
 
-class _Weights:
+class Weights:
     """One set of weights: a hash grid, an MLP as tensors, and the same MLP packed for queries.
 
     Training multiplies matrices (tensor mode), queries use cooperative vectors. Measured on two cores, 28,672 records
@@ -88,7 +90,7 @@ class _Weights:
         )  # fmt: skip
         layers = []
         for _ in range(shape.n_hidden):
-            layers += [nn.Linear(-1, shape.width), nn.ReLU()]
+            layers += [nn.Linear(-1, shape.width), nn.LeakyReLU(shape.leak) if shape.leak else nn.ReLU()]
         network = nn.Sequential(*layers, nn.Linear(-1, shape.n_outputs))
         self.mlp = network.alloc(mi.TensorXf, shape.n_inputs, rng=dr.rng(seed=2 * seed + 1))
 
@@ -168,8 +170,8 @@ class Field:
 
     def reset(self) -> None:
         """Start anew: the weights and the optimiser as they were when the field was made, bit for bit."""
-        self.current = _Weights(self.shape, self.seed)
-        self.averaged = _Weights(self.shape, self.seed)
+        self.current = Weights(self.shape, self.seed)
+        self.averaged = Weights(self.shape, self.seed)
         self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
         self._attach_optimizer()
         self.steps = 0
@@ -181,10 +183,10 @@ class Field:
         self.optimizer.update(self.current.parameters())
         # A frozen step is recorded anew when inputs that shared a variable cease to: from the start, share none
         for key, (value, promoted, lr, (t, *moments)) in self.optimizer.state.items():
-            value = _own(value)
+            value = own_copy(value)
             dr.enable_grad(value)
             self.optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
-        self.averaged.assign({k: _own(v) for k, v in self.averaged.parameters().items()})
+        self.averaged.assign({k: own_copy(v) for k, v in self.averaged.parameters().items()})
         self.averaged.pack()
         dr.eval(self.optimizer, self.averaged)
 
@@ -259,7 +261,7 @@ class Field:
         """Weights from :meth:`snapshot` of a field of equal shape; the optimiser's moments start anew."""
         for name in ("current", "averaged"):
             weights = getattr(self, name)
-            weights.assign({k: _own(type(v)(arrays[f"{name}.{k}"])) for k, v in weights.parameters().items()})
+            weights.assign({k: own_copy(type(v)(arrays[f"{name}.{k}"])) for k, v in weights.parameters().items()})
             weights.pack()
         self._attach_optimizer()
 

@@ -69,8 +69,9 @@ class Training:
         return min(self.ema_decay, 1 - 1 / (0.15 * step + 1))
 
 
-def trace_records(scene, sensor, field: Field | None, training: Training, seed):
-    """Fresh training records, targets ending in the averaged cache (in nothing without a field)."""
+def trace_records(scene, sensor, field: Field | None, training: Training, seed, lights=None):
+    """Fresh training records, targets ending in the averaged cache (in nothing without a field); `lights` as in
+    ``vertex.emitted``."""
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
@@ -78,7 +79,7 @@ def trace_records(scene, sensor, field: Field | None, training: Training, seed):
         return reflect(field, field.encode(si.p), si, bsdf, training.n_tail, sampler, active)
 
     tail = from_cache if field is not None else (lambda si, bsdf, active, sampler: mi.Color3f(0))
-    return trace_training_paths(scene, sensor, sampler, training.n_paths, training.n_vertices, tail)
+    return trace_training_paths(scene, sensor, sampler, training.n_paths, training.n_vertices, tail, lights)
 
 
 def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
@@ -180,21 +181,21 @@ class IncidentCache:
             self._sensor_freezes[id(sensor)] = can_freeze(sensor)
         return self._sensor_freezes[id(sensor)]
 
-    def _probe_plain(self, scene, sensor, seed):
-        return trace_records(scene, sensor, None, self.training, seed)
+    def _probe_plain(self, scene, sensor, lights, seed):
+        return trace_records(scene, sensor, None, self.training, seed, lights)
 
-    def _frame_plain(self, scene, sensor, field, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
         with dr.suspend_grad():
-            records, n_bad = trace_records(scene, sensor, field, self.training, seed)
+            records, n_bad = trace_records(scene, sensor, field, self.training, seed, lights)
             dr.eval(records, n_bad)
         outputs = learn(field, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
         return *outputs, dr.count(records.valid), n_bad
 
-    def start(self, scene, sensor) -> None:
+    def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
         with dr.suspend_grad(), undisturbed():
             probe = self._probe if self.freezes(sensor) else self._probe_plain
-            records, _ = probe(scene, sensor, mi.UInt32(self._seed(0xFFFFFF)))
+            records, _ = probe(scene, sensor, lights, mi.UInt32(self._seed(0xFFFFFF)))
             valid = np.array(records.valid)
             points = np.array(records.position).T[valid]
             target = np.array(records.target).T[valid].mean(axis=-1)
@@ -208,11 +209,11 @@ class IncidentCache:
         self.field = Field(low, high, self.shape, scale=scale, seed=self.seed)
         dr.eval(self.field)
 
-    def train_frame(self, scene, sensor) -> float:
+    def train_frame(self, scene, sensor, lights=None) -> float:
         """Trace fresh records and take one step on them; returns the loss. Divergence is undone, see `recover`."""
         t0 = time.perf_counter()
         if self.field is None:
-            self.start(scene, sensor)
+            self.start(scene, sensor, lights)
         if self._good is None:
             self._good = self.field.snapshot()
         training = self.training
@@ -220,7 +221,7 @@ class IncidentCache:
         frame = self._frame if self.freezes(sensor) else self._frame_plain
         with undisturbed():
             outputs = frame(
-                scene, sensor, self.field, mi.UInt32(self._seed(self.steps)),
+                scene, sensor, lights, self.field, mi.UInt32(self._seed(self.steps)),
                 dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
             )  # fmt: skip
         value, mean_target, mean_prediction, n_valid, n_bad = (v[0] for v in outputs)
@@ -305,7 +306,7 @@ class IncidentCache:
         return len(h) >= 128 and np.median(h[-64:]) > 0.98 * np.median(h[-128:-64])
 
     def train(
-        self, scene, sensor, frames: int | None = None, seconds: float | None = None,
+        self, scene, sensor, lights=None, *, frames: int | None = None, seconds: float | None = None,
         at_least: int = 0, at_most: int = 1000, progress: Callable | None = None,
     ) -> None:  # fmt: skip
         """Train `frames` frames, or for about `seconds`, or (neither given) until `settled`.
@@ -323,7 +324,7 @@ class IncidentCache:
                     break
             elif done >= at_most or (done >= at_least and self.settled()):
                 break
-            self.train_frame(scene, sensor)
+            self.train_frame(scene, sensor, lights)
             done += 1
             if progress is not None:
                 if frames is None and seconds is not None:

@@ -41,18 +41,18 @@ def empty_records(n: int) -> TrainingRecords:
 
 
 def trace_training_paths(
-    scene, sensor, sampler, n_paths: int, n_vertices: int, tail: Callable
+    scene, sensor, sampler, n_paths: int, n_vertices: int, tail: Callable, lights=None
 ) -> tuple[TrainingRecords, mi.UInt32]:
     """Paths from random points of the film; each non-delta vertex but the last gives one record.
 
     The target at vertex k and its sampled direction is the radiance reflected there by vertex k+1,
 
-        R_{k+1} = N_{k+1} + f_{k+1} (E_{k+2} + R_{k+2}),
+        R_{k+1} = N_{k+1} + f_{k+1} (E_{k+1} + R_{k+2}),
 
-    N being next-event estimation, E the emission met by the BSDF ray (the two share the direct light by MIS) and f the
-    BSDF sample's weight. Emission met directly by the record's own direction is not part of it: it belongs to direct
-    light at the record. At the last vertex ``tail(si, bsdf, active, sampler)`` stands for R without N: an estimate from
-    the cache (self-training), or 0.
+    N being next-event estimation at vertex k+1, E the emission met by its BSDF ray (the two share the direct light by
+    MIS) and f the BSDF sample's weight. `lights` chooses lights; None: the scene itself. Emission met directly by the
+    record's own direction is not part of it: it belongs to direct light at the record. At the last vertex ``tail(si,
+    bsdf, active, sampler)`` stands for R without N: an estimate from the cache (self-training), or 0.
 
     Returns ``n_paths * (n_vertices - 1)`` records, and how many targets were not finite and were left out.
     """
@@ -70,21 +70,19 @@ def trace_training_paths(
         sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d(),
     )  # fmt: skip
 
-    def arrive(ray, p_prev, n_prev, pdf, delta, active):
-        si = scene.ray_intersect(ray, active)
-        return si, vertex.emission_mis(scene, si, p_prev, n_prev, pdf, delta, active)
-
-    def bounce(k, ray, p_prev, n_prev, pdf, delta, active, sampler):
-        si, Le = arrive(ray, p_prev, n_prev, pdf, delta, active)
-        active &= si.is_valid()
+    def bounce(k, ray, si, active, sampler):
         bsdf = si.bsdf(ray)
         smooth = active & vertex.has_smooth(bsdf)
-        L_nee = vertex.direct_light(scene, si, bsdf, sampler.next_2d(), smooth)
-
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         wo = si.to_world(bs.wo)
         alive = active & (dr.max(weight) > 0)
+        ray = si.spawn_ray(wo)
+        si_next = scene.ray_intersect(ray, alive)
+        L_nee, Le = vertex.emitted(
+            scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
+            alive,
+        )  # fmt: skip
 
         i = k * n_paths + lane
         dr.scatter(E, Le, i)
@@ -95,20 +93,17 @@ def trace_training_paths(
         n = mi.Vector3f(si.sh_frame.n)
         dr.scatter(records.normal, dr.mulsign(n, dr.dot(n, wo)), i)
         dr.scatter(records.valid, alive & smooth & ~delta, i)
-        return k + 1, si.spawn_ray(wo), mi.Point3f(si.p), mi.Normal3f(si.n), mi.Float(bs.pdf), delta, alive, sampler
+        return k + 1, ray, si_next, alive & si_next.is_valid(), sampler
 
-    state = dr.while_loop(
-        (mi.UInt32(0), mi.Ray3f(ray), mi.Point3f(ray.o), mi.Normal3f(0, 0, 1), mi.Float(1), mi.Bool(True),
-         mi.Bool(True), sampler),
-        lambda k, ray, p, n, pdf, delta, active, sampler: active & (k < n_kept),
+    si = scene.ray_intersect(ray)
+    _, ray, si, active, sampler = dr.while_loop(
+        (mi.UInt32(0), mi.Ray3f(ray), si, si.is_valid(), sampler),
+        lambda k, ray, si, active, sampler: active & (k < n_kept),
         bounce,
         label="training paths",
-    )  # fmt: skip
-    _, ray, p_prev, n_prev, pdf, delta, active, sampler = state
+    )
 
     # The last vertex; if it is a mirror or glass, the one that is seen through it
-    si, E_next = arrive(ray, p_prev, n_prev, pdf, delta, active)
-
     def is_delta(si, active):
         return active & si.is_valid() & ~vertex.has_smooth(si.bsdf())
 
@@ -130,16 +125,24 @@ def trace_training_paths(
     active &= si.is_valid()
     bsdf = si.bsdf(ray)
     smooth = active & vertex.has_smooth(bsdf)
-    L_nee = vertex.direct_light(scene, si, bsdf, sampler.next_2d(), smooth, alone=True)
+    # Direct light with a BSDF ray to share the work: next-event estimation alone varies without bound beside an emitter
+    bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), smooth)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    followed = smooth & (dr.max(weight) > 0)
+    si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
+    L_nee, Le = vertex.emitted(
+        scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, smooth, si_next, bs.pdf, delta, followed
+    )
+    L_nee += vertex.finite(weight * Le, followed)
     R += dr.select(smooth, β * (L_nee + tail(si, bsdf, smooth, sampler)), 0)
 
-    # Back to front. A path that ended early carries zeros from there on; its last vertex' emission is in E.
-    dr.eval(E, N, f, E_next, R, records)
+    # Back to front. E and N of a vertex belong to it: what its own ray met, and its next-event estimation. A path that
+    # ended early carries zeros from there on.
+    dr.eval(E, N, f, R, records)
     for k in reversed(range(n_kept)):
         i = k * n_paths + lane
         dr.scatter(records.target, R, i)
-        R = dr.gather(mi.Color3f, N, i) + dr.gather(mi.Color3f, f, i) * (E_next + R)
-        E_next = dr.gather(mi.Color3f, E, i)
+        R = dr.gather(mi.Color3f, N, i) + dr.gather(mi.Color3f, f, i) * (dr.gather(mi.Color3f, E, i) + R)
 
     finite = dr.all(dr.isfinite(records.target))
     n_bad = dr.count(records.valid & ~finite)

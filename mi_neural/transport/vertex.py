@@ -56,12 +56,56 @@ def emission_mis(scene, si, p_prev, n_prev, pdf_bsdf, delta, active):
 def direct_light(scene, si, bsdf, sample, active, alone=False):
     """Next-event estimation: one emitter sample, one shadow ray.
 
-    `sample` are two uniform numbers. Where `alone` (a mask) holds, no BSDF ray will be traced to share the work with,
-    and the sample counts in full; elsewhere it carries its MIS weight.
+    `sample` are two uniform numbers. With `alone`, no BSDF ray will be traced to share the work with, and the sample
+    counts in full; it may be a function of the BSDF's density, which says where. Elsewhere it carries its MIS weight.
     """
     ds, weight = scene.sample_emitter_direction(si, sample, True, active)
     active = active & (ds.pdf > 0)
     f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-    w_mis = dr.select(ds.delta | alone, 1, mis_weight(ds.pdf, pdf_bsdf))
+    full = ds.delta | (alone(pdf_bsdf) if callable(alone) else bool(alone))
+    w_mis = dr.select(full, 1, mis_weight(ds.pdf, pdf_bsdf))
     return finite(f * weight * w_mis, active)
 
+
+
+def emitted(
+    scene, lights, si, bsdf, u, sample, sampler, active, si_next, pdf_bsdf, delta, followed, alone=None
+):  # fmt: skip
+    """Both halves of direct light at a vertex whose BSDF ray was traced already.
+
+    Next-event estimation, and the emission that the ray met, weighted against each other: ``E[first + f/p second] = ∫
+    f Le cos dω``. `lights` chooses the light (see ``mi_neural.lights.sampling``); None: the scene itself, uniformly.
+    `u`, `sample`: one and two uniform numbers, to choose a light and a point on it. `si_next`: what the BSDF ray met,
+    with density `pdf_bsdf`, where `followed`. ``alone(pdf)`` says at which densities of the BSDF the ray will not be
+    followed and next-event estimation counts in full.
+    """
+    smooth = active & has_smooth(bsdf)
+    if lights is None:
+        L = direct_light(scene, si, bsdf, sample, smooth, alone)
+        return L, emission_mis(scene, si_next, si.p, si.n, pdf_bsdf, delta, followed)
+
+    table = lights.table
+    hit, emits = table.index_of(scene, si_next, followed)
+    n, transmits = receiver(si, bsdf)
+    choice = lights.choose(si, n, transmits, u, sampler, hit, active)
+
+    ds, weight, pdf = table.sample(scene, si, choice.index, sample, smooth & (choice.weight > 0))
+    f, pdf_at_light = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), smooth & (pdf > 0))
+    reaches = smooth & (dr.max(f * weight) > 0)
+    reaches &= ~scene.ray_test(si.spawn_ray_to(ds.p), reaches)
+    counts_in_full = mi.Bool(ds.delta)
+    if alone is not None:
+        counts_in_full |= alone(pdf_at_light)
+    w_mis = dr.select(counts_in_full, 1, mis_weight(choice.pmf * pdf, pdf_at_light))
+    L = finite(f * weight * choice.weight * w_mis, reaches)
+
+    ds_hit = mi.DirectionSample3f(scene, si_next, reference_point(si.p, si.n))
+    pdf_hit = choice.pmf_hit * table.pdf(scene, si, hit, si_next, ds_hit, emits & ~delta)
+    w_mis = dr.select(delta, 1, mis_weight(pdf_bsdf, pdf_hit))
+    return L, dr.select(emits, si_next.emitter(scene, emits).eval(si_next, emits) * w_mis, 0)
+
+
+def receiver(si, bsdf):
+    """How a surface receives light, for choosing one: its normal on the side that is seen, and whether it transmits."""
+    n = mi.Vector3f(si.sh_frame.n)
+    return dr.mulsign(n, si.wi.z), mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)

@@ -1,0 +1,139 @@
+"""What light samplers share: the table of the scene's lights, rebuilt when they change."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.lights.table import LightTable
+
+#: Parameters of a scene that its light table depends on, by the end of their names.
+_LIGHT_PARAMETERS = (
+    "radiance.value", "radiance.scale", "intensity.value", "irradiance.value", "data", "scale", "to_world", "position",
+    "vertex_positions", "faces", "sampling_weight", "cutoff_angle",
+)  # fmt: skip
+
+
+class LightSampler(mi.Emitter):
+    """Base of the light samplers. Subclasses give `make`.
+
+    A light sampler emits nothing: it is nested in an integrator, under the name ``light_sampler``. It is asked for the
+    object that chooses lights in a scene by ``lights(scene, sensor)``, before each image; None stands for the scene's
+    own choice.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.plugin = props.plugin_name()
+        self.reset()
+
+    def _check(self, ok: bool, message: str) -> None:
+        if not ok:
+            raise ValueError(f"{self.plugin}: {message}")
+
+    def reset(self) -> None:
+        """Forget the scene and what was learned of it."""
+        self.scene_key = None
+        self.watched: list = []
+        self.sampler = None
+
+    # -------------------------------------------------------------------------------------------------------------
+    # To be given by the plugin
+
+    def make(self, scene, table: LightTable):
+        """What chooses among the lights of `table`; see :mod:`mi_neural.lights.sampling`."""
+        raise NotImplementedError(f"{type(self).__name__} must define make()")
+
+    def train(self, scene, sensor) -> None:
+        """Learn what is learned from image to image."""
+
+    def statistics(self) -> dict:
+        """Facts since the last reset."""
+        return {}
+
+    # -------------------------------------------------------------------------------------------------------------
+
+    def lights(self, scene, sensor, train: bool = True):
+        """What chooses lights in `scene`; None where there is nothing to choose, at no cost then.
+
+        The table is made anew where the scene is another one, or its lights changed.
+        """
+        key = (id(scene), len(scene.shapes()), len(scene.emitters()))
+        if key != self.scene_key:
+            self.reset()
+            self.scene_key = key
+            self.watched = _watch(scene)
+            self.stamp = None
+        if not self.watched:
+            return None
+        stamp = [_stamp(params, name) for params, name in self.watched]
+        with dr.suspend_grad():
+            if stamp != self.stamp:
+                self.stamp = stamp
+                table = LightTable(scene)
+                self.sampler = self.make(scene, table) if table.n_lights > 1 else None
+            if self.sampler is not None and train:
+                with dr.resume_grad():
+                    self.train(scene, sensor)
+        return self.sampler
+
+    def to_string(self):
+        return f"{type(self).__name__}[]"
+
+    # -------------------------------------------------------------------------------------------------------------
+    # It is an emitter to Mitsuba, whose calls are compiled for all emitters alive: one that gives nothing
+
+    def eval(self, si, active=True):
+        return mi.Spectrum(0)
+
+    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        return dr.zeros(mi.Ray3f), mi.Spectrum(0)
+
+    def sample_direction(self, it, sample, active=True):
+        return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+
+    def pdf_direction(self, it, ds, active=True):
+        return mi.Float(0)
+
+    def eval_direction(self, it, ds, active=True):
+        return mi.Spectrum(0)
+
+    def sample_position(self, time, sample, active=True):
+        return dr.zeros(mi.PositionSample3f), mi.Float(0)
+
+    def pdf_position(self, ps, active=True):
+        return mi.Float(0)
+
+    def sample_wavelengths(self, si, sample, active=True):
+        return dr.zeros(mi.Wavelength), mi.Spectrum(0)
+
+
+def _watch(scene) -> list:
+    """Parameters that the table is made of, as (parameters, name); empty if there is at most one light."""
+    emitters = scene.emitters()
+    if len(emitters) < 2 and not any(
+        e.get_shape() is not None and e.get_shape().primitive_count() > 1 for e in emitters
+    ):
+        return []
+    watched = []
+    for emitter in emitters:
+        shape = emitter.get_shape()
+        params = mi.traverse(shape if shape is not None else emitter)
+        watched += [(params, name) for name in params.keys() if name.endswith(_LIGHT_PARAMETERS)]
+    return watched
+
+
+def _stamp(params, name):
+    """What changes when a parameter does: the numbers of its variables, or its text."""
+    value = params[name]
+    if hasattr(value, "matrix"):
+        value = value.matrix
+    if not dr.is_jit_v(value):
+        return str(value)
+    if dr.is_tensor_v(value):
+        value = value.array
+    return _indices(value)
+
+
+def _indices(value):
+    return (value.index, dr.width(value)) if dr.depth_v(value) == 1 else tuple(_indices(v) for v in value)

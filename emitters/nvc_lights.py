@@ -1,0 +1,129 @@
+"""``nvc_lights``: lights by what they give, times their learned visibility."""
+
+import mitsuba as mi
+
+from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining
+from mi_neural.emitters.common import LightSampler
+from mi_neural.lights import clusters
+from mi_neural.lights.sampling import VisibleLights
+
+
+class NVCLightSampler(LightSampler):
+    r"""
+    .. _emitter-nvc_lights:
+
+    Choice of lights by learned visibility (:monosp:`nvc_lights`)
+    -------------------------------------------------------------
+
+    Chooses light :math:`i` with a probability proportional to what it would give the surface without shadows, times
+    the share of it that is visible from there as a small network predicts (neural visibility cache; METHODS 4 and the
+    seed's eq. for p(x)):
+
+    .. math:: p_i(x) \propto E_i(x) \max(V_i(x), 0.03).
+
+    :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines at both ends (Conty Estevez
+    and Kulla 2018). Unbiased whatever the network says, since no light that can contribute has probability 0. With
+    more lights than ``outputs`` the network knows clusters of them: a cluster is chosen as above, then one light in it
+    by resampling ``candidates`` of its lights.
+
+    .. pluginparameters::
+
+     * - outputs
+       - |int|
+       - Most outputs of the network; up to that many lights are known one by one. (Default: 32)
+     * - clusters
+       - |string|
+       - What an output stands for where there are more lights: ``kmeans`` (near each other), ``emitter`` (all
+         triangles of an emitter), ``auto`` (by emitter if there are few, small ones). (Default: auto)
+     * - candidates
+       - |int|
+       - Lights of a cluster that one is resampled from. (Default: 16)
+     * - visibility
+       - |bool|
+       - Use the network. false: choose by unshadowed light alone, nothing is trained. (Default: true)
+     * - train_frames
+       - |int|
+       - Training steps before the first image. (Default: 64)
+     * - train_steps
+       - |int|
+       - Training steps before each later image. (Default: 1)
+     * - train_samples
+       - |int|
+       - Points per step; each sends one shadow ray to every output. (Default: 8192)
+     * - freeze
+       - |bool|
+       - Do not train; an untrained network says 1/2 for every light. (Default: false)
+     * - seed
+       - |int|
+       - Of the initial weights, the training points and the clusters. (Default: 0)
+
+    *Works with* all emitters of Mitsuba; point, spot and directional lights, meshes of thousands of emissive triangles
+    and the environment (as one light) can be mixed. With a single light it costs nothing. *Leaves out* the choice of a
+    direction within the environment: that stays Mitsuba's.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nirc"> <emitter type="nvc_lights" name="light_sampler"/> </integrator>
+
+        .. code-tab:: python
+
+            mi.load_dict({"type": "nirc", "light_sampler": {"type": "nvc_lights", "outputs": 32}})
+    """
+
+    def __init__(self, props):
+        self.cache = None
+        self.outputs = props.get("outputs", 32)
+        self.clusters = props.get("clusters", "auto")
+        self.candidates = props.get("candidates", 16)
+        self.visibility = props.get("visibility", True)
+        self.train_frames = props.get("train_frames", 64)
+        self.train_steps = props.get("train_steps", 1)
+        self.train_samples = props.get("train_samples", 8192)
+        self.freeze = props.get("freeze", False)
+        self.seed = props.get("seed", 0)
+        super().__init__(props)
+        self._check(2 <= self.outputs <= 256, f"outputs is {self.outputs}; it must lie in 2..256")
+        self._check(self.clusters in clusters.METHODS,
+                    f"clusters is '{self.clusters}'; give one of: {', '.join(clusters.METHODS)}")  # fmt: skip
+        self._check(self.candidates >= 1, f"candidates is {self.candidates}; it must be at least 1")
+        self._check(self.train_frames >= 0, f"train_frames is {self.train_frames}; it must be 0 or more")
+        self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
+        self._check(self.train_samples >= 4, f"train_samples is {self.train_samples}; it must be at least 4")
+        self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
+        self.cache = VisibilityCache(VisibilityTraining(n_points=self.train_samples), seed=self.seed)
+
+    def reset(self) -> None:
+        super().reset()
+        if self.cache is not None:
+            self.cache.reset()
+
+    def make(self, scene, table):
+        try:
+            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed)
+        except ValueError as e:
+            raise ValueError(f"{self.plugin}: {e}") from None
+        field = self.cache.field if self.visibility else None
+        if field is not None and field.shape.n_outputs != groups.n_groups:
+            self.cache.reset()  # lights appeared or went
+            field = None
+        return VisibleLights(table, groups, field, self.candidates)
+
+    def train(self, scene, sensor) -> None:
+        if not self.visibility:
+            return
+        steps = 0 if self.freeze else self.train_steps if self.cache.steps else self.train_frames
+        self.cache.train(scene, sensor, self.sampler.table, self.sampler.groups, steps)
+        self.sampler.field = self.cache.field
+
+    def statistics(self) -> dict:
+        if self.sampler is None:
+            return {}
+        facts = {"lights": self.sampler.table.n_lights, "light_groups": self.sampler.groups.n_groups}
+        return facts | (self.cache.statistics if self.visibility else {})
+
+    def to_string(self):
+        return f"NVCLightSampler[outputs={self.outputs}, clusters={self.clusters}, candidates={self.candidates}]"
+
+
+mi.register_emitter("nvc_lights", lambda props: NVCLightSampler(props))

@@ -1,0 +1,43 @@
+"""``power_lights``: lights in proportion to their power."""
+
+import mitsuba as mi
+
+from mi_neural.emitters.common import LightSampler
+from mi_neural.lights.sampling import PowerLights
+
+
+class PowerLightSampler(LightSampler):
+    r"""
+    .. _emitter-power_lights:
+
+    Choice of lights by power (:monosp:`power_lights`)
+    ---------------------------------------------------
+
+    Chooses light :math:`i` with a probability proportional to its power :math:`\Phi_i`, those at infinity by what they
+    give the whole scene; a tenth is shared equally. A light is an emissive triangle (a rectangle counts as one light),
+    or any other emitter as a whole. Unbiased.
+
+    .. pluginparameters::
+
+     * - (none)
+       -
+       -
+
+    *Works with* all emitters of Mitsuba, nested in an integrator of this package under the name ``light_sampler``.
+    Knows nothing of distance, direction or shadows: ``nvc_lights`` does.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="plain_path"> <emitter type="power_lights" name="light_sampler"/> </integrator>
+
+        .. code-tab:: python
+
+            mi.load_dict({"type": "plain_path", "light_sampler": {"type": "power_lights"}})
+    """
+
+    def make(self, scene, table):
+        return PowerLights(table)
+
+
+mi.register_emitter("power_lights", lambda props: PowerLightSampler(props))

@@ -1,0 +1,177 @@
+"""Groups of lights: what a visibility cache has an output for."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .table import DIRECTION, ENVIRONMENT, LOCAL, LightTable
+
+METHODS = ("auto", "kmeans", "emitter")
+
+
+class Groups:
+    """A partition of a light table into at most `n_outputs` groups. A PyTree.
+
+    As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in Python lists
+    `kind`, and in arrays. `start`, `count`: its range in `member`, the lights sorted by group; `within` is the
+    probability of a light in its group (proportional to its intensity), `cumulative` its running sum over `member`;
+    `group_of` leads from light to group.
+    """
+
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "center": object, "radius": object, "axis": object, "cone": object, "intensity": object, "start": object,
+        "count": object, "member": object, "within": object, "cumulative": object, "group_of": object,
+    }  # fmt: skip
+
+    def __init__(self, table: LightTable, label: np.ndarray, intensity: np.ndarray | None = None):
+        c = table.columns
+        label = np.unique(label, return_inverse=True)[1].ravel()
+        self.n_groups = int(label.max(initial=-1)) + 1
+        self.n_lights = table.n_lights
+        order = np.lexsort((morton(c["center"]), label))
+        count = np.bincount(label, minlength=self.n_groups)
+        start = np.cumsum(count) - count
+        intensity = np.maximum((c["intensity"] if intensity is None else intensity).astype(np.float64), 0)
+        total = np.bincount(label, intensity, self.n_groups)
+        # No light is left out: a tenth is shared equally, so that a dark mean hides no bright part
+        within = (
+            0.9 * intensity / np.where(total > 0, total, 1)[label] + np.where(total > 0, 0.1, 1)[label] / count[label]
+        )
+        cumulative = np.cumsum(within[order])
+        cumulative -= (cumulative[start] - within[order][start])[label[order]]
+        cumulative[start + count - 1] = 1.0
+        self.single = bool((count == 1).all())
+
+        weight = np.where(total[label] > 0, intensity, 1.0)
+
+        def mean(v):
+            sums = [np.bincount(label, weight * v[:, i], self.n_groups) for i in range(3)]
+            return np.stack(sums, -1) / np.bincount(label, weight, self.n_groups)[:, None]
+
+        centers = c["center"].astype(np.float64)
+        center = mean(centers)
+        self.kind = [int(k) for k in c["kind"][order][start]]
+        radius = np.zeros(self.n_groups)
+        np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
+        radius[[k != LOCAL for k in self.kind]] = 0
+        axis = mean(c["axis"].astype(np.float64))
+        length = np.linalg.norm(axis, axis=1)
+        axis = np.where(length[:, None] > 1e-6, axis / np.maximum(length, 1e-30)[:, None], [0, 0, 1])
+        angle = np.arccos(np.clip((c["axis"] * axis[label]).sum(axis=1), -1, 1)) + np.arccos(np.clip(c["cone"], -1, 1))
+        widest = np.zeros(self.n_groups)
+        np.maximum.at(widest, label, angle)
+        one = count == 1
+        radius[one] = c["radius"][order][start][one]
+        self.host = {"label": label, "count": count, "intensity": total, "center": center, "radius": radius}
+        cone = np.where(widest >= np.pi - 1e-3, -1.0, np.cos(widest + np.where(one, 0, 1e-4)))
+        cone[[k != LOCAL for k in self.kind]] = -1
+        vec = lambda v: mi.Vector3f(np.ascontiguousarray(v.T, np.float32))  # noqa: E731
+        flt = lambda v: mi.Float(np.ascontiguousarray(v, np.float32))  # noqa: E731
+        num = lambda v: mi.UInt32(np.ascontiguousarray(v, np.uint32))  # noqa: E731
+        self.center, self.radius, self.axis, self.cone, self.intensity = (
+            vec(center),
+            flt(radius),
+            vec(axis),
+            flt(cone),
+            flt(total),
+        )
+        self.start, self.count, self.member = num(start), num(count), num(order)
+        self.within, self.cumulative, self.group_of = flt(within), flt(cumulative), num(label)
+        self.search_steps = int(count.max(initial=1) - 1).bit_length()
+        dr.eval(self)
+
+    def sample_light(self, group, u, active):
+        """A light of `group` with probability `within`: (index, probability)."""
+        first = dr.gather(mi.UInt32, self.start, group, active)
+        if self.single:
+            return dr.gather(mi.UInt32, self.member, first, active), mi.Float(1)
+        count = dr.gather(mi.UInt32, self.count, group, active)
+        low = mi.UInt32(0)
+        for bit in reversed(range(self.search_steps)):
+            right = low + 2**bit
+            ahead = active & (right < count)
+            low = dr.select(ahead & (u >= dr.gather(mi.Float, self.cumulative, first + right - 1, ahead)), right, low)
+        low += first
+        light = dr.gather(mi.UInt32, self.member, low, active)
+        return light, dr.gather(mi.Float, self.within, light, active)
+
+
+def morton(points: np.ndarray) -> np.ndarray:
+    """Place on a space-filling curve (ten bits an axis) of `points` (n, 3)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    q = ((points - low) / np.maximum(high - low, 1e-30) * 1023).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((q[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code
+
+
+def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0) -> Groups:
+    """Groups of a table: each light alone if they are no more than `n_outputs`, else clusters.
+
+    `method`: ``emitter`` (all triangles of an emitter together), ``kmeans``, or ``auto``: by emitter where they are
+    few enough and small, else k-means. Lights at infinity and the environment are always alone.
+    """
+    c = table.columns
+    n = table.n_lights
+    if n <= n_outputs:
+        return Groups(table, np.arange(n))
+    by_emitter = np.unique(c["emitter"], return_inverse=True)[1].ravel()
+    if method == "emitter" or (method == "auto" and by_emitter.max() + 1 <= n_outputs
+                               and np.bincount(by_emitter).max() <= 64):  # fmt: skip
+        if by_emitter.max() + 1 <= n_outputs:
+            return Groups(table, by_emitter)
+        raise ValueError(
+            f"there are {by_emitter.max() + 1} emitters, more than the {n_outputs} outputs; "
+            'use clusters="kmeans" or raise outputs'
+        )
+    alone = c["kind"] != LOCAL
+    n_alone = int(alone.sum())
+    if n_alone >= n_outputs:
+        raise ValueError(
+            f"{n_alone} lights are at infinity, which cannot be clustered, and there are {n_outputs} outputs; "
+            "raise outputs"
+        )
+    label = np.zeros(n, np.int64)
+    label[alone] = np.arange(n_alone)
+    features = np.concatenate([c["center"], 0.0 * c["axis"]], axis=1)[~alone].astype(np.float64)
+    label[~alone] = n_alone + kmeans(features, n_outputs - n_alone, np.maximum(c["intensity"][~alone], 1e-30), seed)
+    return Groups(table, label)
+
+
+def kmeans(points: np.ndarray, k: int, weights: np.ndarray, seed: int = 0, rounds: int = 30) -> np.ndarray:
+    """Labels of Lloyd's algorithm from a k-means++ start; `points` (n, d), `weights` (n,).
+
+    Fewer than k clusters may come out.
+    """
+    rng = np.random.default_rng(seed)
+    n = len(points)
+    if n <= k:
+        return np.arange(n)
+    p = weights / weights.sum()
+    centers = points[[rng.choice(n, p=p)]]
+    d2 = ((points - centers[0]) ** 2).sum(axis=1)
+    for _ in range(k - 1):
+        mass = d2 * p
+        if mass.sum() <= 0:
+            break
+        centers = np.vstack([centers, points[rng.choice(n, p=mass / mass.sum())]])
+        d2 = np.minimum(d2, ((points - centers[-1]) ** 2).sum(axis=1))
+    label = np.full(n, -1)
+    for _ in range(rounds):
+        square = (centers**2).sum(axis=1) - 2 * points @ centers.T
+        new = square.argmin(axis=1)
+        if (new == label).all():
+            break
+        label = new
+        mass = np.bincount(label, weights, len(centers))
+        for axis in range(points.shape[1]):
+            mean = np.bincount(label, weights * points[:, axis], len(centers)) / np.maximum(mass, 1e-300)
+            centers[:, axis] = np.where(mass > 0, mean, centers[:, axis])
+    return label
+
+
+__all__ = ["DIRECTION", "ENVIRONMENT", "LOCAL", "METHODS", "Groups", "kmeans", "make_groups"]
