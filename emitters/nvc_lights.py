@@ -19,7 +19,7 @@ class NVCLightSampler(LightSampler):
     the share of it that is visible from there as a small network predicts (neural visibility cache; METHODS 4 and the
     seed's eq. for p(x)):
 
-    .. math:: p_i(x) \propto E_i(x) \max(V_i(x), 0.03).
+    .. math:: p_i(x) \propto E_i(x) \max(V_i(x), 0.06).
 
     :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines at both ends (Conty Estevez
     and Kulla 2018). Unbiased whatever the network says, since no light that can contribute has probability 0. With
@@ -49,7 +49,7 @@ class NVCLightSampler(LightSampler):
        - Training steps before each later image. (Default: 1)
      * - train_samples
        - |int|
-       - Points per step; each sends one shadow ray to every output. (Default: 8192)
+       - Points per step; each sends one shadow ray to every output. (Default: 2048)
      * - freeze
        - |bool|
        - Do not train; an untrained network says 1/2 for every light. (Default: false)
@@ -79,7 +79,7 @@ class NVCLightSampler(LightSampler):
         self.visibility = props.get("visibility", True)
         self.train_frames = props.get("train_frames", 64)
         self.train_steps = props.get("train_steps", 1)
-        self.train_samples = props.get("train_samples", 8192)
+        self.train_samples = props.get("train_samples", 2048)
         self.freeze = props.get("freeze", False)
         self.seed = props.get("seed", 0)
         super().__init__(props)

@@ -73,7 +73,7 @@ def test_known_answer_within_two_percent_by_every_termination(name, termination)
     assert integrator.cache.steps == 60
     assert abs(image.mean() - 1) < 0.02
     parts = image.mean(axis=-1).reshape(4, 4, 4, 4).mean(axis=(1, 3))
-    # Gathered vertices next to a wall that shines rely on next-event estimation alone, whose variance has no bound there
+    # Gathered vertices beside a wall that shines rely on next-event estimation alone: its variance has no bound there
     assert np.median(np.abs(parts - 1)) < 0.02 and np.abs(parts - 1).max() < 0.3
 
 

@@ -28,14 +28,13 @@ SHADOW_EPSILON = 1e-3
 class VisibilityTraining:
     """Constants of training.
 
-    n_points                 points per step: half of them uniform in the box, a quarter on the surfaces that the
-                             camera sees, a quarter on those one bounce further
+    n_points                 points per step, see `training_points`
     ema_decay                longest horizon of the averaged weights that queries use: 1 / (1 - ema_decay) steps
     first_rate, last_rate    learning rates of Adam; the rate falls linearly
     ramp                     over so many steps
     """
 
-    n_points: int = 8192
+    n_points: int = 2048
     ema_decay: float = 0.9
     first_rate: float = 0.05
     last_rate: float = 0.001
@@ -127,28 +126,35 @@ def _sigmoid(v):
 
 
 def training_points(scene, sensor, field: VisibilityField, n: int, seed):
-    """`n` points: a half uniform in the field's box, a quarter seen by the camera, a quarter one diffuse bounce
-    further.
+    """`n` points: a quarter uniform in the field's box, the others on surfaces, at the first, second or third vertex of paths
+    that start at the camera and bounce diffusely.
 
-    A ray that leaves the scene gives a point in the box instead.
+    A path that leaves the scene stays at the vertex before; one that never met a surface gives a point in the box.
     """
     lane = dr.arange(mi.UInt32, n)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
     in_box = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / field.box_inv_extent + field.box_min
-    ray, _ = sensor.sample_ray(
-        sensor.shutter_open(), sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d()
-    )  # fmt: skip
-    on_surface = lane % 2 == 0
-    si = scene.ray_intersect(ray, on_surface)
-    wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
-    wo.z = dr.mulsign(wo.z, si.wi.z)
-    onward = on_surface & (lane % 4 == 0) & si.is_valid()
-    si_next = scene.ray_intersect(si.spawn_ray(si.to_world(wo)), onward)
-    si = dr.select(onward & si_next.is_valid(), si_next, si)
-    found = on_surface & si.is_valid()
-    # Off the surface, to the side that was seen
-    offset = si.spawn_ray(si.to_world(mi.Vector3f(0, 0, dr.sign(si.wi.z)))).o
-    return dr.select(found, offset, in_box)
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d())
+    n_bounces = lane % 4  # 0: in the box
+    on_surface = n_bounces > 0
+
+    def bounce(k, ray, x, found, active, sampler):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        found |= active
+        side = mi.Vector3f(0, 0, dr.sign(si.wi.z))
+        x = dr.select(active, si.spawn_ray(si.to_world(side)).o, x)  # off the surface, to the side that was seen
+        wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        wo.z = dr.mulsign(wo.z, si.wi.z)
+        return k + 1, si.spawn_ray(si.to_world(wo)), x, found, active & (k + 1 < n_bounces), sampler
+
+    _, _, x, found, _, _ = dr.while_loop(
+        (mi.UInt32(0), mi.Ray3f(ray), mi.Point3f(in_box), mi.Bool(False), mi.Bool(on_surface), sampler),
+        lambda k, ray, x, found, active, sampler: active,
+        bounce,
+        label="visibility points",
+    )
+    return dr.select(found, x, in_box)
 
 
 class VisibilityCache:
@@ -186,7 +192,7 @@ class VisibilityCache:
             points = np.concatenate([np.array(s.p).T[v] for s, v in zip((si, si_next), valid, strict=True)])
         low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
         shape = self.shape or FieldShape(
-            n_levels=8, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.5, direction_degree=-1,
+            n_levels=10, n_features=4, hashmap_size=2**14, base_resolution=16, per_level_scale=1.4, direction_degree=-1,
             width=32, n_hidden=2, n_outputs=n_outputs, leak=0.01,
         )  # fmt: skip
         self.field = VisibilityField(low, high, shape, self.seed)
