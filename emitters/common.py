@@ -25,17 +25,16 @@ class LightSampler(mi.Emitter):
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
-        self.reset()
+        self.scene_key, self.stamp = None, None
+        self.watched: list = []
+        self.sampler = None
 
     def _check(self, ok: bool, message: str) -> None:
         if not ok:
             raise ValueError(f"{self.plugin}: {message}")
 
     def reset(self) -> None:
-        """Forget the scene and what was learned of it."""
-        self.scene_key = None
-        self.watched: list = []
-        self.sampler = None
+        """Forget what was learned. The table of lights is kept."""
 
     # -------------------------------------------------------------------------------------------------------------
     # To be given by the plugin
@@ -61,9 +60,8 @@ class LightSampler(mi.Emitter):
         key = (id(scene), len(scene.shapes()), len(scene.emitters()))
         if key != self.scene_key:
             self.reset()
-            self.scene_key = key
+            self.scene_key, self.stamp, self.sampler = key, None, None
             self.watched = _watch(scene)
-            self.stamp = None
         if not self.watched:
             return None
         stamp = [_stamp(params, name) for params, name in self.watched]

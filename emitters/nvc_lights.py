@@ -43,7 +43,7 @@ class NVCLightSampler(LightSampler):
        - Use the network. false: choose by unshadowed light alone, nothing is trained. (Default: true)
      * - train_frames
        - |int|
-       - Training steps before the first image. (Default: 64)
+       - Training steps before the first image. (Default: 32)
      * - train_steps
        - |int|
        - Training steps before each later image. (Default: 1)
@@ -77,7 +77,7 @@ class NVCLightSampler(LightSampler):
         self.clusters = props.get("clusters", "auto")
         self.candidates = props.get("candidates", 16)
         self.visibility = props.get("visibility", True)
-        self.train_frames = props.get("train_frames", 64)
+        self.train_frames = props.get("train_frames", 32)
         self.train_steps = props.get("train_steps", 1)
         self.train_samples = props.get("train_samples", 2048)
         self.freeze = props.get("freeze", False)
@@ -94,9 +94,10 @@ class NVCLightSampler(LightSampler):
         self.cache = VisibilityCache(VisibilityTraining(n_points=self.train_samples), seed=self.seed)
 
     def reset(self) -> None:
-        super().reset()
         if self.cache is not None:
             self.cache.reset()
+        if self.sampler is not None:
+            self.sampler.field = None
 
     def make(self, scene, table):
         try:

@@ -3,11 +3,11 @@
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.common import LIGHT_SAMPLER_KEY, light_sampler_of
+from mi_neural.integrators.common import LIGHT_SAMPLER_KEY, LightSamplingIntegrator
 from mi_neural.transport import vertex
 
 
-class PlainPathIntegrator(mi.SamplingIntegrator):
+class PlainPathIntegrator(LightSamplingIntegrator):
     __doc__ = (
         r"""
     .. _integrator-plain_path:
@@ -58,25 +58,6 @@ class PlainPathIntegrator(mi.SamplingIntegrator):
             raise ValueError(f"plain_path: max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
         if self.rr_depth < 1:
             raise ValueError(f"plain_path: rr_depth is {self.rr_depth}; it must be at least 1")
-
-        self.light_sampler = light_sampler_of(props)
-        self.lights, self.entered = None, False
-
-    def prepare_lights(self, scene, sensor, train: bool = True) -> None:
-        """Have lights chosen as they are in `scene` now."""
-        if self.light_sampler is not None:
-            self.lights = self.light_sampler.lights(scene, sensor, train)
-
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        if self.entered:  # Mitsuba's own render() comes back here once
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
-        self.entered = True
-        try:
-            self.prepare_lights(scene, sensor)
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
-        finally:
-            self.entered = False
 
     @dr.syntax
     def sample(self, scene, sampler, ray, medium=None, active=True):
