@@ -3,7 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.common import LIGHT_SAMPLER_KEY, LightSamplingIntegrator
+from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, LightSamplingIntegrator
 from mi_neural.transport import vertex
 
 
