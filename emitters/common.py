@@ -7,12 +7,6 @@ import mitsuba as mi
 
 from mi_neural.lights.table import LightTable
 
-#: Parameters of a scene that its light table depends on, by the end of their names.
-_LIGHT_PARAMETERS = (
-    "radiance.value", "radiance.scale", "intensity.value", "irradiance.value", "data", "scale", "to_world", "position",
-    "vertex_positions", "faces", "sampling_weight", "cutoff_angle",
-)  # fmt: skip
-
 
 class LightSampler(mi.Emitter):
     """Base of the light samplers. Subclasses give `make`.
@@ -25,7 +19,7 @@ class LightSampler(mi.Emitter):
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
-        self.scene_key, self.stamp = None, None
+        self.scene, self.scene_key, self.held = None, None, None
         self.watched: list = []
         self.sampler = None
 
@@ -57,17 +51,16 @@ class LightSampler(mi.Emitter):
 
         The table is made anew where the scene is another one, or its lights changed.
         """
-        key = (id(scene), len(scene.shapes()), len(scene.emitters()))
-        if key != self.scene_key:
+        key = (len(scene.shapes()), len(scene.emitters()))
+        if scene is not self.scene or key != self.scene_key:
             self.reset()
-            self.scene_key, self.stamp, self.sampler = key, None, None
+            self.scene, self.scene_key, self.held, self.sampler = scene, key, None, None
             self.watched = _watch(scene)
         if not self.watched:
             return None
-        stamp = [_stamp(params, name) for params, name in self.watched]
         with dr.suspend_grad():
-            if stamp != self.stamp:
-                self.stamp = stamp
+            if self.held is None or any(_changed(*w, h) for w, h in zip(self.watched, self.held, strict=True)):
+                self.held = [_hold(params[name]) for params, name in self.watched]
                 table = LightTable(scene)
                 self.sampler = self.make(scene, table) if table.n_lights > 1 else None
             if self.sampler is not None and train:
@@ -117,21 +110,24 @@ def _watch(scene) -> list:
     for emitter in emitters:
         shape = emitter.get_shape()
         params = mi.traverse(shape if shape is not None else emitter)
-        watched += [(params, name) for name in params.keys() if name.endswith(_LIGHT_PARAMETERS)]
+        watched += [(params, name) for name in params.keys() if not name.startswith("bsdf.")]
     return watched
 
 
-def _stamp(params, name):
-    """What changes when a parameter does: the numbers of its variables, or its text."""
+def _hold(value):
+    """A value as it is now, with its variables kept alive, so that none of their numbers is given to another."""
+    return type(value)(value) if dr.is_jit_v(value) else str(value)
+
+
+def _changed(params, name, held) -> bool:
     value = params[name]
-    if hasattr(value, "matrix"):
-        value = value.matrix
-    if not dr.is_jit_v(value):
-        return str(value)
+    return _identity(value) != _identity(held) if dr.is_jit_v(value) else str(value) != held
+
+
+def _identity(value):
+    """The numbers and widths of an array's variables."""
     if dr.is_tensor_v(value):
-        value = value.array
-    return _indices(value)
-
-
-def _indices(value):
-    return (value.index, dr.width(value)) if dr.depth_v(value) == 1 else tuple(_indices(v) for v in value)
+        return _identity(value.array)
+    if not dr.is_array_v(value):  # a transformation
+        return _identity(value.matrix)
+    return (value.index, dr.width(value)) if dr.depth_v(value) == 1 else tuple(_identity(v) for v in value)

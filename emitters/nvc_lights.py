@@ -72,7 +72,7 @@ class NVCLightSampler(LightSampler):
     """
 
     def __init__(self, props):
-        self.cache = None
+        self.cache, self.begun = None, False
         self.outputs = props.get("outputs", 32)
         self.clusters = props.get("clusters", "auto")
         self.candidates = props.get("candidates", 16)
@@ -94,6 +94,7 @@ class NVCLightSampler(LightSampler):
         self.cache = VisibilityCache(VisibilityTraining(n_points=self.train_samples), seed=self.seed)
 
     def reset(self) -> None:
+        self.begun = False
         if self.cache is not None:
             self.cache.reset()
         if self.sampler is not None:
@@ -107,13 +108,15 @@ class NVCLightSampler(LightSampler):
         field = self.cache.field if self.visibility else None
         if field is not None and field.shape.n_outputs != groups.n_groups:
             self.cache.reset()  # lights appeared or went
+            self.begun = False
             field = None
         return VisibleLights(table, groups, field, self.candidates)
 
     def train(self, scene, sensor) -> None:
         if not self.visibility:
             return
-        steps = 0 if self.freeze else self.train_steps if self.cache.steps else self.train_frames
+        steps = 0 if self.freeze else self.train_steps if self.begun else self.train_frames
+        self.begun = True
         self.cache.train(scene, sensor, self.sampler.table, self.sampler.groups, steps)
         self.sampler.field = self.cache.field
 

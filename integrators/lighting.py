@@ -46,6 +46,11 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         finally:
             self.entered = False
 
+    def ready(self, scene) -> None:
+        """Have lights chosen also where another integrator (``aov``) asks for samples and no image is rendered."""
+        if not self.entered:
+            self.prepare_lights(scene, scene.sensors()[0])
+
     def prepare_lights(self, scene, sensor, train: bool = True) -> None:
         """Have lights chosen as they are in `scene` now; one frame of training."""
         if self.light_sampler is not None:

@@ -211,7 +211,7 @@ class NIRCIntegrator(CacheIntegrator):
             β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
             β = dr.select(is_delta(si, chain) & ~goes_on, 0, β)
             ray = dr.select(goes_on, si.spawn_ray(si.to_world(bs.wo)), ray)
-            return depth + 1, ray, β, L, goes_on, sampler
+            return depth + dr.select(goes_on, 1, 0), ray, β, L, goes_on, sampler
 
         depth, ray, β, L, _, sampler = dr.while_loop(
             (mi.UInt32(0), mi.Ray3f(ray), β, L, mi.Bool(chain), sampler),

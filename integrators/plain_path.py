@@ -63,6 +63,7 @@ class PlainPathIntegrator(LightSamplingIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True):
         max_depth = mi.UInt32(self.max_depth if self.max_depth >= 0 else 0xFFFFFFFF)
         bsdf_ctx = mi.BSDFContext()
+        self.ready(scene)
 
         ray = mi.Ray3f(dr.detach(ray))
         L = mi.Spectrum(0)  # Radiance so far

@@ -20,9 +20,6 @@ from ..transport.samples import PathSampler
 from . import encoding
 from .field import FieldShape, Weights, own_copy
 
-#: Rays end this share of their length before the light, so that the light itself is not in the way.
-SHADOW_EPSILON = 1e-3
-
 
 @dataclass(frozen=True)
 class VisibilityTraining:
@@ -126,8 +123,8 @@ def _sigmoid(v):
 
 
 def training_points(scene, sensor, field: VisibilityField, n: int, seed):
-    """`n` points: a quarter uniform in the field's box, the others on surfaces, at the first, second or third vertex of paths
-    that start at the camera and bounce diffusely.
+    """`n` points: a quarter uniform in the field's box, the others on surfaces, at the first, second or third vertex
+    of paths that start at the camera and bounce diffusely.
 
     A path that leaves the scene stays at the vertex before; one that never met a surface gives a point in the box.
     """
@@ -206,13 +203,9 @@ class VisibilityCache:
             point, group = lane % n, lane // n
             sampler = PathSampler.make(lane, seed + 1)
             light = groups.sample_light(group, sampler.next_1d(), mi.Bool(True))[0]
-            target, is_direction = table.shadow_target(light, sampler.next_2d(), mi.Bool(True))
             p = dr.gather(mi.Point3f, x, point)
-            to = dr.select(is_direction, target, target - p)
-            distance = dr.norm(to)
-            ray = mi.Ray3f(p, to / dr.maximum(distance, 1e-30))
-            ray.maxt = dr.select(is_direction, dr.largest(mi.Float), distance * (1 - SHADOW_EPSILON))
-            visible = dr.select(scene.ray_test(ray, distance > 0), mi.Float(0), 1)
+            ray, some = table.shadow_ray(scene, p, light, sampler.next_2d(), mi.Bool(True))
+            visible = dr.select(scene.ray_test(ray, some), mi.Float(0), 1)
             dr.eval(visible)
         return field.step(x, mi.TensorXf(visible, shape=(n_out, n)), learning_rate, decay)
 

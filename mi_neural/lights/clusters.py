@@ -42,6 +42,11 @@ class Groups:
         cumulative = np.cumsum(within[order])
         cumulative -= (cumulative[start] - within[order][start])[label[order]]
         cumulative[start + count - 1] = 1.0
+        # What is drawn is what the rounded sums say
+        cumulative = np.maximum.accumulate(cumulative.astype(np.float32) + label[order].astype(np.float64))
+        cumulative -= label[order]
+        before = np.where(np.arange(len(order)) == start[label[order]], 0, np.concatenate([[0], cumulative[:-1]]))
+        within[order] = cumulative - before
         self.single = bool((count == 1).all())
 
         weight = np.where(total[label] > 0, intensity, 1.0)
@@ -68,7 +73,8 @@ class Groups:
         cone = np.where(widest >= np.pi - 1e-3, -1.0, np.cos(widest + np.where(one, 0, 1e-4)))
         cone[[k != LOCAL for k in self.kind]] = -1
         vec = lambda v: mi.Vector3f(np.ascontiguousarray(v.T, np.float32))  # noqa: E731
-        flt = lambda v: mi.Float(np.ascontiguousarray(v, np.float32))  # noqa: E731
+        big = np.finfo(np.float32).max
+        flt = lambda v: mi.Float(np.ascontiguousarray(np.minimum(v, big), np.float32))  # noqa: E731
         num = lambda v: mi.UInt32(np.ascontiguousarray(v, np.uint32))  # noqa: E731
         self.center, self.radius, self.axis, self.cone, self.intensity = (
             vec(center),
@@ -137,8 +143,9 @@ def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: i
         )
     label = np.zeros(n, np.int64)
     label[alone] = np.arange(n_alone)
-    features = np.concatenate([c["center"], 0.0 * c["axis"]], axis=1)[~alone].astype(np.float64)
-    label[~alone] = n_alone + kmeans(features, n_outputs - n_alone, np.maximum(c["intensity"][~alone], 1e-30), seed)
+    features = c["center"][~alone].astype(np.float64)
+    weights = np.maximum(c["intensity"][~alone].astype(np.float64), 1e-30)
+    label[~alone] = n_alone + kmeans(features, n_outputs - n_alone, weights, seed)
     return Groups(table, label)
 
 

@@ -65,8 +65,9 @@ class PowerLights:
         self.table = table
         c = table.columns
         # Lights at infinity are weighed by the irradiance they would give the whole scene
-        power = np.where(c["kind"] == LOCAL, np.pi * c["intensity"], c["intensity"] * table.cross_section)
-        self.groups = Groups(table, np.zeros(table.n_lights, int), power)
+        intensity = c["intensity"].astype(np.float64)
+        power = np.where(c["kind"] == LOCAL, np.pi * intensity, intensity * table.cross_section)
+        self.groups = Groups(table, np.zeros(table.n_lights, int), power / max(power.max(initial=0), 1e-300))
 
     def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:
         index, pmf = self.groups.sample_light(mi.UInt32(0), u, active)
@@ -95,7 +96,7 @@ class VisibleLights:
         weights = []
         for k, kind in enumerate(g.kind):
             w = importance(_Light(g, mi.UInt32(k), kind), p, n, transmits)
-            weights.append(w * dr.maximum(visible[k], VISIBILITY_FLOOR))
+            weights.append(w * dr.fmax(visible[k], VISIBILITY_FLOOR))
         return weights
 
     def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:

@@ -17,6 +17,9 @@ MAX_LIGHTS = 2**24
 #: Samples of an emitter's light or place that its entry is made from.
 PROBES = 16
 
+#: Shadow rays end this share of their length before the light, so that the light itself is not in the way.
+SHADOW_EPSILON = 1e-3
+
 LOCAL, DIRECTION, ENVIRONMENT = range(3)
 
 
@@ -163,26 +166,32 @@ class LightTable:
             pdf = dr.select(flat, pdf, ds.emitter.pdf_direction(si_ref, ds, other))
         return dr.select(active, pdf, 0)
 
-    def shadow_target(self, index, sample, active):
-        """A random point of light `index` for a visibility test from anywhere: (point, or direction; is a direction).
-
-        Flat lights: uniform on the area. Others: in the bounding sphere's centre. Environment: uniform over the sphere.
-        """
-        center = dr.gather(mi.Vector3f, self.center, index, active)
-        kind = dr.gather(mi.UInt32, self.kind, index, active)
-        target = center
+    def shadow_ray(self, scene, p, index, sample, active):
+        """A ray from the points `p` to a random point of light `index`, for a visibility test: uniform on the area of
+        flat lights, the emitter's own choice on others. Not normalised by what the point may receive."""
+        it = vertex.reference_point(p, mi.Normal3f(0, 0, 1))
+        target = mi.Point3f(p)
+        flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
         if self.any_flat:
-            flat = dr.gather(mi.Bool, self.flat, index, active)
             u, v = sample.x, sample.y
             fold = dr.gather(mi.Bool, self.folded, index, active) & (u + v > 1)
             u, v = dr.select(fold, 1 - u, u), dr.select(fold, 1 - v, v)
             corner, edge1, edge2 = (
                 dr.gather(mi.Vector3f, a, index, active & flat) for a in (self.corner, self.edge1, self.edge2)
             )
-            target = dr.select(flat, corner + u * edge1 + v * edge2, target)
-        if ENVIRONMENT in self.kinds:
-            target = dr.select(kind == ENVIRONMENT, mi.warp.square_to_uniform_sphere(sample), target)
-        return target, kind != LOCAL
+            target = mi.Point3f(corner + u * edge1 + v * edge2)
+        if not self.all_flat:
+            other = active & ~flat
+            emitter = dr.gather(
+                mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, other), other
+            )
+            ds, _ = emitter.sample_direction(it, sample, other)
+            target = dr.select(flat, target, ds.p)
+        to = target - p
+        distance = dr.norm(to)
+        ray = mi.Ray3f(p, to / dr.maximum(distance, 1e-30))
+        ray.maxt = distance * (1 - SHADOW_EPSILON)
+        return ray, distance > 0
 
 
 def importance(light, x, n, two_sided):
@@ -264,6 +273,7 @@ def _meshes(emitters, shapes, counts, is_mesh, rng) -> dict[str, np.ndarray]:
     b = np.concatenate([np.eye(3)[:, 1:], rng.dirichlet((1, 1, 1), PROBES)[:, :2]])
     k = len(b)
     rows = np.repeat(np.flatnonzero(flat), k)
+    varies = np.array(emitters.flags() & int(mi.EmitterFlags.SpatiallyVarying)) > 0
     lights = dr.gather(mi.EmitterPtr, emitters, mi.UInt32(emitter[rows]))
     on = dr.gather(mi.ShapePtr, shapes, mi.UInt32(emitter[rows]))
     uv = mi.Point2f(np.tile(b, (m, 1)).T.astype(np.float32))
@@ -278,7 +288,7 @@ def _meshes(emitters, shapes, counts, is_mesh, rng) -> dict[str, np.ndarray]:
     Le = np.where(np.isfinite(Le), Le, 0)
     p0, p1, p2 = p[:, 0], p[:, 1], p[:, 2]
     radiance, n_sh0 = Le.mean(axis=1), n_sh[:, 3]
-    bent = (np.abs((n_geo * n_sh).sum(axis=-1) - 1) > 1e-4).any(axis=1)
+    bent = (np.abs(np.abs((n_geo * n_sh).sum(axis=-1)) - 1) > 1e-4).any(axis=1)
     cross = np.cross(p1 - p0, p2 - p0)
     length = np.linalg.norm(cross, axis=1)
     normal = cross / np.maximum(length, 1e-300)[:, None]
@@ -290,7 +300,11 @@ def _meshes(emitters, shapes, counts, is_mesh, rng) -> dict[str, np.ndarray]:
         columns[name][flat] = values
 
     put("corner", p0), put("edge1", p1 - p0), put("edge2", p2 - p0), put("normal", normal)
-    put("area", 0.5 * length), put("radiance", radiance), put("plain", constant & ~bent)
+    (
+        put("area", 0.5 * length),
+        put("radiance", radiance),
+        put("plain", constant & ~bent & ~(varies & np.ones(len(counts), bool))[emitter[flat]]),
+    )
     center = (p0 + p1 + p2) / 3
     put("center", center)
     put("radius", np.sqrt(np.max([((p - center) ** 2).sum(axis=1) for p in (p0, p1, p2)], axis=0)))
@@ -338,6 +352,20 @@ def _merge_rectangles(columns, counts, is_mesh) -> dict[str, np.ndarray]:
     return {k: v[keep] for k, v in c.items()}
 
 
+def _glow(lamps, places: np.ndarray) -> np.ndarray:
+    """Radiant intensity of lamps without extent in the brightest of 1024 directions."""
+    m, k = len(places), 1024
+    i = np.arange(k) + 0.5
+    z, phi = 1 - 2 * i / k, i * np.pi * (3 - np.sqrt(5))  # a spiral of equal steps
+    r = np.sqrt(1 - z * z)
+    around = places[:, None] + np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+    it = vertex.reference_point(mi.Point3f(around.reshape(-1, 3).T.astype(np.float32)), mi.Normal3f(0, 0, 1))
+    lamps = dr.gather(mi.EmitterPtr, lamps, dr.repeat(dr.arange(mi.UInt32, m), k))
+    _, weight = lamps.sample_direction(it, mi.Point2f(0.5), True)
+    weight = np.array(weight + dr.zeros(mi.Color3f, m * k), np.float64).T.reshape(m, k, 3)
+    return np.nan_to_num(weight, posinf=0, neginf=0).mean(axis=2).max(axis=1)
+
+
 def _others(columns, scene, emitters, rng) -> None:
     """Fill in the entries of emitters that are not meshes, by looking at samples of their light."""
     rows = np.flatnonzero(~columns["flat"])
@@ -353,30 +381,45 @@ def _others(columns, scene, emitters, rng) -> None:
     # Where they are and what they give, seen from the middle of the scene
     box = scene.bbox()
     middle = np.array(box.center(), np.float64).ravel()
-    size = float(np.linalg.norm(np.array(box.extents(), np.float64)))
-    middle, size = (middle, size) if np.isfinite(middle).all() and np.isfinite(size) else (np.zeros(3), 1.0)
+    middle = middle if np.isfinite(middle).all() else np.zeros(3)
     k = 4 * PROBES
-    u = mi.Float(np.tile(rng.random((k, 4)), (m, 1)).T.astype(np.float32).ravel())
-    u = [dr.gather(mi.Float, u, dr.arange(mi.UInt32, m * k) + i * m * k) for i in range(4)]
+    u = mi.Point2f(np.tile(rng.random((k, 2)), (m, 1)).T.astype(np.float32))
     each = dr.repeat(dr.arange(mi.UInt32, m), k)
     lights = dr.gather(mi.EmitterPtr, lights, each)
-    it = vertex.reference_point(mi.Point3f(*middle.tolist()) + dr.zeros(mi.Point3f, m * k), mi.Normal3f(0, 0, 1))
-    ds, weight = lights.sample_direction(it, mi.Point2f(u[0], u[1]), True)
-    ray, power = lights.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), True)
-    dr.eval(ds.d, weight, ray.o, power)
+    n = m * k
+    away = mi.Point3f(*middle.tolist()) + dr.zeros(mi.Point3f, n)
+    ds, weight = lights.sample_direction(vertex.reference_point(away, mi.Normal3f(0, 0, 1)), u, True)
+    # Surfaces: points all over them
+    on = lights.get_shape()
+    ps = on.sample_position(mi.Float(0), u, mi.Bool(np.repeat(surface, k)))
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.p, si.n, si.uv, si.wi, si.t = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1), mi.Float(1)
+    si.sh_frame = mi.Frame3f(ps.n)
+    Le = lights.eval(si, mi.Bool(np.repeat(surface, k)))
+    area = on.surface_area()
+    dr.eval(ds.d, ds.p, weight, ps.p, ps.n, Le, area)
 
     def probes(v):
-        return np.nan_to_num(np.array(v + dr.zeros(type(v), m * k), np.float64), posinf=0, neginf=0).T.reshape(m, k, 3)
+        return np.nan_to_num(np.array(v + dr.zeros(type(v), n), np.float64), posinf=0, neginf=0).T.reshape(m, k, 3)
 
-    irradiance, intensity = (probes(v).mean(axis=(1, 2)) for v in (weight, power))
-    direction, points = probes(ds.d).sum(axis=1), np.swapaxes(probes(ray.o), 0, 1)
-    center = points.mean(axis=0)
-    radius = 1.25 * np.linalg.norm(points - center, axis=-1).max(axis=0)
+    irradiance = probes(weight).mean(axis=(1, 2))
+    direction = probes(ds.d).mean(axis=1)
+    points = np.where(surface[:, None, None], probes(ps.p), probes(ds.p))
+    normals = probes(ps.n)
+    area = (np.array(area, np.float64) * np.ones(n)).reshape(m, k)[:, 0]
+    center = points.mean(axis=1)
+    radius = 1.25 * np.linalg.norm(points - center[:, None], axis=-1).max(axis=1)
     unit = direction / np.maximum(np.linalg.norm(direction, axis=-1), 1e-30)[:, None]
+    even = surface & (np.linalg.norm(normals - normals[:, :1], axis=-1).max(axis=1) < 1e-4)
+    intensity = probes(Le).mean(axis=(1, 2)) * area
+    lamp = np.flatnonzero(~surface & ~environment & ~distant)
+    if lamp.size:
+        glow = _glow(dr.gather(mi.EmitterPtr, emitters, mi.UInt32(columns["emitter"][rows[lamp]])), center[lamp])
+        # One that was dark in all directions looked at may be a narrow beam
+        intensity[lamp] = np.where(glow > 0, glow, 1e-3 * max(glow.max(), intensity.max(initial=0)))
     columns["kind"][rows] = np.where(environment, ENVIRONMENT, np.where(distant, DIRECTION, LOCAL))
     columns["center"][rows] = np.where(distant[:, None], unit, center)
-    columns["radius"][rows] = np.where(environment | distant, 0, np.where(surface, radius, 0))
-    columns["intensity"][rows] = np.where(
-        environment, irradiance / 4, np.where(distant, irradiance, intensity / np.where(surface, np.pi, 4 * np.pi))
-    )
-    columns["axis"][rows] = [0, 0, 1]
+    columns["radius"][rows] = np.where(surface, radius, 0)
+    columns["intensity"][rows] = np.where(environment, irradiance / 4, np.where(distant, irradiance, intensity))
+    columns["axis"][rows] = np.where(even[:, None], normals[:, 0], [0, 0, 1])
+    columns["cone"][rows] = np.where(even, 1, -1)

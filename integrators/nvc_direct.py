@@ -1,0 +1,405 @@
+"""``nvc_direct``: direct light by learned visibility."""
+
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.caches.direct import DirectCache, DirectTraining, albedo
+from mi_neural.caches.visibility import VisibilityCache
+from mi_neural.integrators.common import check_scene, light_sampler_of
+from mi_neural.lights import clusters
+from mi_neural.lights.sampling import VisibleLights
+from mi_neural.lights.table import LightTable
+from mi_neural.lights.unshadowed import UnshadowedLights
+from mi_neural.transport import vertex
+from mi_neural.transport.samples import PathSampler
+
+MODES = ("sampled", "neural")
+CACHES = ("visibility", "radiance")
+CHANNELS = ("visibility", "light", "pmf")
+#: Bounces between mirrors from which Russian roulette may end a path.
+RR_DEPTH = 8
+
+
+class NVCDirectIntegrator(mi.SamplingIntegrator):
+    r"""
+    .. _integrator-nvc_direct:
+
+    Direct light by neural visibility (:monosp:`nvc_direct`)
+    --------------------------------------------------------
+
+    Emission, and direct light at the first surface that is not a mirror; mirrors and glass on the way are followed.
+    With ``mode="sampled"`` each shadow ray goes to a light that the ``light_sampler`` chooses, by default one that has
+    learned which lights are visible from where, and a BSDF ray is weighted against it: unbiased, whatever was learned.
+    With ``mode="neural"`` there are no shadow rays: all lights are summed, each as it would be without shadows, times
+    its predicted visibility (the seed's "neural direct illumination"),
+
+    .. math:: L = L_e + \sum_k V_k(x) \int f L_k \cos\theta\, d\omega,
+
+    free of noise at the first vertex, but biased: shadows are as sharp as the network's grid, areas of a light are not
+    told apart, and glossy lobes are linearly transformed cosines. For previews.
+
+    .. pluginparameters::
+
+     * - mode
+       - |string|
+       - ``sampled`` (unbiased) or ``neural`` (no shadow rays; no more lights than the light sampler has outputs).
+         (Default: sampled)
+     * - cache
+       - |string|
+       - ``visibility``, or ``radiance``: the baseline NRC-DI, a network that holds reflected direct light itself and is
+         read without shadow rays, for comparison; ``mode`` does not matter then. (Default: visibility)
+     * - light_samples
+       - |int|
+       - Shadow rays, and BSDF rays, per camera sample (``sampled``). (Default: 1)
+     * - max_depth
+       - |int|
+       - Longest path in segments, mirrors included: 1 shows emitters; with 2, mirrors show emitters only, and
+         ``sampled`` has the mean of ``path`` with that depth; -1 means no limit. (Default: -1)
+     * - hide_emitters
+       - |bool|
+       - Leave out what the camera sees of emitters directly. (Default: false)
+     * - light_sampler
+       - |emitter|
+       - Nested plugin that chooses the light of each shadow ray; ``neural`` needs an ``nvc_lights``. It is trained
+         before each image as its own keys say. (Default: an ``nvc_lights`` with this seed)
+     * - train_frames
+       - |int|
+       - Training steps of the ``radiance`` cache before the first image. (Default: 256)
+     * - train_steps
+       - |int|
+       - Training steps of the ``radiance`` cache before each later image. (Default: 1)
+     * - train_samples
+       - |int|
+       - Its points per step, each with one sample of direct light. (Default: 8192)
+     * - freeze_cache
+       - |bool|
+       - Do not train the ``radiance`` cache. (Default: false)
+     * - seed
+       - |int|
+       - Of initial weights and training points. (Default: 0)
+     * - channels
+       - |string|
+       - Extra channels, a comma-separated list of ``visibility`` (predicted, of light number ``light``), ``light``
+         (number of a light as it is chosen there, -1 for none; with 1 sample a pixel), ``pmf`` (its probability).
+         (Default: none)
+     * - light
+       - |int|
+       - Which light the channel ``visibility`` shows, in the order of the light table; of clustered lights, that of its
+         cluster. (Default: 0)
+
+    *Works with* all surfaces and emitters of Mitsuba. *Leaves out* light reflected more than once (use ``nirc``),
+    participating media (use ``volpath``), and in ``neural``: textures on lights and the detail of the environment
+    (their mean counts), shadows within the environment. What a material's mirror lobe shows of lights (``plastic``) is
+    traced in every mode.
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters, ``neural`` with more lights than outputs.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nvc_direct">
+                <string name="mode" value="neural"/>
+                <emitter type="nvc_lights" name="light_sampler"> <integer name="outputs" value="32"/> </emitter>
+            </integrator>
+
+        .. code-tab:: python
+
+            mi.load_dict({"type": "nvc_direct", "mode": "neural"})
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.plugin = props.plugin_name()
+        self.mode = props.get("mode", "sampled")
+        self.kind = props.get("cache", "visibility")
+        self.light_samples = props.get("light_samples", 1)
+        self.max_depth = props.get("max_depth", -1)
+        self.hide = props.get("hide_emitters", False)
+        self.train_frames = props.get("train_frames", 256)
+        self.train_steps = props.get("train_steps", 1)
+        self.train_samples = props.get("train_samples", 8192)
+        self.freeze_cache = props.get("freeze_cache", False)
+        self.seed = props.get("seed", 0)
+        self.light = props.get("light", 0)
+        self.channels = [n.strip() for n in props.get("channels", "").split(",") if n.strip()]
+        for name, value, known in (("mode", self.mode, MODES), ("cache", self.kind, CACHES)):
+            self._check(value in known, f"{name} is '{value}'; give one of: {', '.join(known)}")
+        for name, value, least in (("light_samples", self.light_samples, 1), ("train_frames", self.train_frames, 0),
+                                   ("train_steps", self.train_steps, 0), ("train_samples", self.train_samples, 4),
+                                   ("seed", self.seed, 0), ("light", self.light, 0)):  # fmt: skip
+            self._check(value >= least, f"{name} is {value}; it must be at least {least}")
+        self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
+        for n in self.channels:
+            self._check(n in CHANNELS, f"unknown channel '{n}'; it has: {', '.join(CHANNELS)}")
+        self.light_sampler = light_sampler_of(props) or mi.load_dict({"type": "nvc_lights", "seed": self.seed})
+        self.depth_limit = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
+        trace = partial(direct_records, self.depth_limit)
+        self.cache = DirectCache(trace, DirectTraining(self.train_samples), self.seed)
+        self.entered = False
+        self.reset()
+
+    def _check(self, ok: bool, message: str) -> None:
+        if not ok:
+            raise ValueError(f"{self.plugin}: {message}")
+
+    @property
+    def predicts(self) -> bool:
+        """Whether direct light is the sum over lights of what is predicted."""
+        return self.kind == "visibility" and self.mode == "neural"
+
+    # -------------------------------------------------------------------------------------------------------------
+    # State
+
+    def reset(self) -> None:
+        """Forget what was learned; the next image trains anew."""
+        self.light_sampler.reset()
+        self.cache.reset()
+        self.scene_key = None
+        self.lights = None  # what chooses lights; None: the scene itself
+        self.unshadowed: UnshadowedLights | None = None
+        self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
+        self.mixed = self.mirrors = True  # whether materials have mirror lobes beside others, and nothing else
+
+    def statistics(self) -> dict:
+        """Facts since the last reset."""
+        facts = dict(self.light_sampler.statistics())
+        if self.only_light is not None:
+            facts |= {"lights": 1, "light_groups": 1} | self.only_light.statistics
+        return facts | (self.cache.statistics if self.kind == "radiance" else {})
+
+    def prepare_lights(self, scene, sensor, train: bool = True) -> None:
+        """Train as the keys say, and have all ready for an image of `scene` as it is now."""
+        if (key := _key(scene)) != self.scene_key:
+            check_scene(scene, self.plugin)
+            if self.scene_key is not None:
+                self.reset()
+            self.mixed, self.mirrors = delta_lobes(scene)
+            self.scene_key = key
+        with dr.resume_grad():
+            self.lights = self.light_sampler.lights(scene, sensor, train)
+            if self.kind == "radiance":
+                steps = self.train_steps if self.cache.steps else self.train_frames
+                self.cache.train(scene, sensor, self.lights, steps if train and not self.freeze_cache else 0)
+        if self.lights is None and (self.predicts or self.channels):
+            self.lights = self._only_light(scene, sensor, train)
+        knows = getattr(self.lights, "field", None) is not None
+        needs = "needs an nvc_lights with visibility=true as light_sampler"
+        if "visibility" in self.channels:
+            self._check(knows, f"the channel 'visibility' {needs}")
+            n = self.lights.table.n_lights
+            self._check(self.light < n, f"light is {self.light}; the scene has lights 0..{n - 1}")
+        if self.predicts:
+            self._check(knows, f'mode="neural" {needs}; or use mode="sampled"')
+            self._check_single(self.lights)
+            with dr.suspend_grad():
+                if self.unshadowed is None or self.unshadowed.table is not self.lights.table:
+                    self.unshadowed = UnshadowedLights(scene, self.lights.table)
+                else:
+                    self.unshadowed.refresh()
+
+    def _check_single(self, lights) -> None:
+        self._check(
+            lights.groups.single,
+            f'mode="neural" must know each light by itself, and there are {lights.table.n_lights} lights for '
+            f'{lights.groups.n_groups} outputs; use mode="sampled", or raise outputs of the light_sampler (up to 256)',
+        )
+
+    def _only_light(self, scene, sensor, train: bool):
+        """A light sampler of the scene's single light, which is not worth one elsewhere."""
+        with dr.suspend_grad():
+            table = LightTable(scene)
+            groups = clusters.make_groups(table, 1)
+        settings = self.light_sampler
+        self._check(getattr(settings, "cache", None) is not None, "one light needs nvc_lights as light_sampler")
+        if self.only_light is None:
+            self.only_light = VisibilityCache(settings.cache.training, seed=self.seed)
+        steps = settings.train_steps if self.only_light.steps else settings.train_frames
+        with dr.resume_grad():
+            self.only_light.train(scene, sensor, table, groups, steps if train and not settings.freeze else 0)
+        return VisibleLights(table, groups, self.only_light.field)
+
+    # -------------------------------------------------------------------------------------------------------------
+    # Rendering
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        if isinstance(sensor, int):
+            if not scene.sensors():
+                check_scene(scene, self.plugin)
+            sensor = scene.sensors()[sensor]
+        if self.entered:  # Mitsuba's own render() comes back here once
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+        self.entered = True
+        try:
+            self.prepare_lights(scene, sensor)
+            with dr.suspend_grad():
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
+        finally:
+            self.entered = False
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        if not self.entered and self.scene_key != _key(scene):  # inside another integrator
+            self.prepare_lights(scene, scene.sensors()[0])
+        ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active) & (self.depth_limit > 0)
+
+        # What the camera sees
+        if self.hide:
+            pi = self.skip_area_emitters(scene, ray, True, active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            L, valid = mi.Color3f(0), active & si.is_valid()
+        else:
+            si = scene.ray_intersect(ray, active)
+            L = mi.Color3f(vertex.emission(scene, si, active))
+            valid = active & (si.is_valid() | (si.emitter(scene, active) != None))  # noqa: E711
+
+        L_seen, β, si, active, sampler = follow_mirrors(
+            scene, sampler, si, self.depth_limit, self.mirrors, active & si.is_valid()
+        )
+        bsdf = si.bsdf()
+        L += L_seen
+
+        # Direct light at the first surface that is not a mirror
+        if self.kind == "radiance":
+            direct = albedo(si, bsdf, active) * self.cache.query(si.p) + self.mirrored(scene, si, bsdf, sampler, active)
+        elif self.mode == "neural":
+            direct = self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), active)
+            direct += self.mirrored(scene, si, bsdf, sampler, active)
+        else:
+            direct = self.sampled(scene, si, bsdf, sampler, active)
+        L += dr.select(active, β * direct, 0)
+        return L, valid, self.extra(si, bsdf, sampler, active) if self.channels else []
+
+    def sampled(self, scene, si, bsdf, sampler, active):
+        """E = ∫ f Le cos dω, by `light_samples` pairs of a shadow ray and a BSDF ray."""
+        n = self.light_samples
+
+        def pair(i, total, sampler):
+            # The BSDF's share
+            bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+            weight = vertex.finite(weight, active)
+            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            followed = active & (dr.max(weight) > 0)
+            si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
+
+            # The chosen light, and both weighted against each other
+            u = (mi.Float(i) + sampler.next_1d()) / n
+            L_nee, Le = vertex.emitted(
+                scene, self.lights, si, bsdf, u, sampler.next_2d(), sampler, active, si_next, bs.pdf, delta, followed,
+            )  # fmt: skip
+            return i + 1, total + L_nee + weight * Le, sampler
+
+        if n == 1:
+            return pair(mi.UInt32(0), mi.Color3f(0), sampler)[1]
+        _, total, _ = dr.while_loop(
+            (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, *_: active & (i < n), pair, label="shadow rays"
+        )
+        return total / n
+
+    def mirrored(self, scene, si, bsdf, sampler, active):
+        """Emission that the mirror lobes of a material with others beside show."""
+        if not self.mixed:
+            return mi.Color3f(0)
+        ctx = mi.BSDFContext()
+        ctx.type_mask = mi.BSDFFlags.Delta
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        weight = vertex.finite(weight, active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
+        seen = active & (dr.max(weight) > 0)
+        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), seen)
+        return weight * vertex.emission(scene, si_next, seen)
+
+    def extra(self, si, bsdf, sampler, active) -> list:
+        """The channels asked for, at the first surface that is not a mirror."""
+        values = {}
+        if "visibility" in self.channels:
+            group = self.lights.groups.host["label"][self.light]
+            values["visibility"] = dr.select(active, self.lights.field.query(si.p)[group], 0)
+        if "light" in self.channels or "pmf" in self.channels:
+            n, transmits = vertex.receiver(si, bsdf)
+            smooth = active & vertex.has_smooth(bsdf)
+            choice = self.lights.choose(si, n, transmits, sampler.next_1d(), sampler, mi.UInt32(0), smooth)
+            chosen = smooth & (choice.weight > 0)
+            values["light"] = dr.select(chosen, mi.Float(choice.index), -1)
+            values["pmf"] = dr.select(chosen, choice.pmf, 0)
+        return [values[name] for name in self.channels]
+
+    def aov_names(self):
+        return list(self.channels)
+
+    def to_string(self):
+        return (
+            f"NVCDirectIntegrator[\n  mode = {self.mode},\n  cache = {self.kind},\n"
+            f"  light_samples = {self.light_samples},\n  max_depth = {self.max_depth},\n"
+            f"  light_sampler = {self.light_sampler.to_string()}\n]"
+        )
+
+
+def _key(scene) -> tuple:
+    """What tells scenes apart."""
+    return id(scene), len(scene.shapes()), len(scene.emitters())
+
+
+def delta_lobes(scene) -> tuple[bool, bool]:
+    """Whether materials of `scene` have mirror lobes beside others, and whether some have nothing else."""
+    shapes = scene.shapes()
+    if any(s.bsdf() is None or s.class_name() == "Instance" for s in shapes):
+        return True, True  # not all materials can be seen from here
+    flags = [s.bsdf().flags() for s in shapes]
+    smooth = [f for f in flags if mi.has_flag(f, mi.BSDFFlags.Smooth)]
+    return any(mi.has_flag(f, mi.BSDFFlags.Delta) for f in smooth), len(smooth) < len(flags)
+
+
+def follow_mirrors(scene, sampler, si, max_depth: int, mirrors: bool, active):
+    """Go on from `si` through surfaces without a smooth lobe, if there are such `mirrors`, to the first with one.
+
+    Returns (emission on the way, throughput, that surface, whether there is one within the depth, sampler).
+    """
+    β = dr.select(active, mi.Color3f(1), 0)
+    if not mirrors:
+        return mi.Color3f(0), β, si, active & (max_depth > 1), sampler
+    chain = active & ~vertex.has_smooth(si.bsdf())
+
+    def bounce(depth, si, β, L, chain, sampler):
+        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), chain)
+        β = dr.select(chain, β * weight, β)
+        roulette = chain & (depth >= RR_DEPTH)
+        q = dr.minimum(dr.max(β), 0.95)
+        goes_on = chain & (depth < max_depth) & (dr.max(β) > 0) & (~roulette | (sampler.next_1d() < q))
+        β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
+        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), goes_on)
+        L += dr.select(goes_on, β * vertex.emission(scene, si_next, goes_on), 0)
+        β = dr.select(chain & ~(goes_on & si_next.is_valid()), 0, β)
+        si = dr.select(goes_on, si_next, si)
+        return depth + 1, si, β, L, goes_on & si_next.is_valid() & ~vertex.has_smooth(si_next.bsdf()), sampler
+
+    depth, si, β, L, _, sampler = dr.while_loop(
+        (mi.UInt32(1), si, β, mi.Color3f(0), chain, sampler), lambda depth, si, β, L, chain, sampler: chain, bounce,
+        label="mirrors",
+    )  # fmt: skip
+    return L, β, si, active & (dr.max(β) > 0) & (depth < max_depth), sampler
+
+
+def direct_records(max_depth: int, scene, sensor, lights, n: int, seed):
+    """Training points of the radiance cache, where the camera looks: (position, direct light over albedo, valid)."""
+    lane = dr.arange(mi.UInt32, n)
+    sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d())
+    si = scene.ray_intersect(ray)
+    _, _, si, active, sampler = follow_mirrors(scene, sampler, si, max_depth, delta_lobes(scene)[1], si.is_valid())
+    bsdf = si.bsdf()
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    weight = vertex.finite(weight, active & ~delta)  # mirror lobes are traced when the cache is read
+    followed = active & (dr.max(weight) > 0)
+    si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
+    L_nee, Le = vertex.emitted(
+        scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
+        followed,
+    )  # fmt: skip
+    target = (L_nee + weight * Le) / albedo(si, bsdf, active)
+    valid = active & dr.all(dr.isfinite(target))
+    return mi.Point3f(si.p), mi.Color3f(dr.select(valid, target, 0)), valid
+
+
+mi.register_integrator("nvc_direct", lambda props: NVCDirectIntegrator(props))

@@ -1,0 +1,579 @@
+"""``restir_di``: direct light by reuse of light samples over pixels and frames."""
+
+import copy
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_neural.integrators.common import check_scene, light_sampler_of
+from mi_neural.lights.sampling import PowerLights
+from mi_neural.lights.table import LightTable
+from mi_neural.transport import reservoir, vertex
+from mi_neural.transport.freezing import can_freeze, undisturbed
+from mi_neural.transport.reservoir import Reservoir
+from mi_neural.transport.samples import PathSampler
+
+COMBINATIONS = ("unbiased", "biased")
+CANDIDATES = ("light", "nvc")
+NVC_WHERE = ("everywhere", "disoccluded")
+
+
+@dataclass
+class Past:
+    """What one frame leaves to the next, one entry a pixel.
+
+    kept     what was kept of the light samples
+    surface  what the pixel's camera ray met, as far as a BSDF asks for it
+    usable   whether that has a smooth lobe
+    """
+
+    kept: Reservoir
+    surface: mi.SurfaceInteraction3f
+    usable: mi.Bool
+
+
+class _State:
+    """What changes from frame to frame. Apart, because a frozen function is recorded anew whenever an attribute of the
+    integrator that it belongs to changes."""
+
+    def __init__(self):
+        self.frames: dict = {}  # recorded functions
+        self.freeze = True
+        self.chooser = self.power = None
+        self.key: tuple = ()
+        self.reset()
+
+    def reset(self) -> None:
+        self.past: Past | None = None
+        self.past_power: PowerLights | None = None
+        self.past_camera: tuple | None = None
+        self.frame = 0
+
+
+class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
+    __doc__ = r"""
+    .. _integrator-restir_di:
+
+    Direct light by reservoir resampling over pixels and frames (:monosp:`restir_di`)
+    ---------------------------------------------------------------------------------
+
+    Estimates emission and direct light at the first surface, as ``path`` does with ``max_depth = 2``, for the frames of
+    a running sequence: each pixel keeps one light sample, chosen among candidates of its own, what it kept in the frame
+    before and what its neighbours keep (Bitterli et al. 2020). Without bias by default, while geometry and materials
+    stand still; the camera may move and the lights may change. With :math:`y` the kept sample (a light, and two numbers
+    :math:`u` that choose a point on it),
+
+    .. math:: L_o = L_e + w_b \frac{f L_e \cos\theta}{p_b} + w_l \frac{f L_e V \cos\theta}{p(y \mid u)} \, W_y, \qquad
+              W_y = \frac{1}{\hat p(y)} \sum_i m_i(y_i) \, \hat p(y_i) \, W_i,
+
+    and :math:`W_i = 1 / p_i` of a candidate (Bitterli et al. 2020, eq. 6). Samples are reused as :math:`u`, by which a
+    light of any kind can be sampled again from elsewhere without a Jacobian. The emission that a BSDF ray meets is a
+    second estimate with its own MIS weight :math:`w_b = 1 - w_l` (one BSDF ray against ``initial_candidates`` lights in
+    proportion to power). It is not reused: sharp reflections of lights look as in ``path``.
+
+    ``unbiased``: the target :math:`\hat p` includes visibility and is tested anew wherever a sample goes; :math:`m_i`
+    are the balance heuristic over frames and defensive pairwise weights over pixels (Bitterli 2022; Lin et al. 2022),
+    which have less noise than 1/Z. Up to 5 + 2 ``spatial_samples`` rays a pixel. ``biased``: :math:`\hat p` without
+    visibility and :math:`m_i = M_i / \sum M` (1/M), 4 rays; too dark at shadows and edges.
+
+    One frame is one sample a pixel. A ``render`` call with ``spp`` samples renders so many frames and returns their
+    mean; their noise is correlated, so that ``restir_di`` is for one or few samples a pixel.
+
+    .. pluginparameters::
+
+     * - initial_candidates
+       - |int|
+       - Light samples that a pixel chooses from in each frame; the winner sends a shadow ray. (Default: 8)
+     * - candidates
+       - |string|
+       - ``light``: in proportion to power; ``nvc``: as the nested ``light_sampler`` chooses, ``nvc_lights`` if there is
+         none. (Default: nvc where a ``light_sampler`` is nested, else light)
+     * - nvc_where
+       - |string|
+       - ``everywhere``, or ``disoccluded``: only in pixels that the frame before does not know, ``light`` candidates
+         elsewhere. (Default: everywhere)
+     * - light_sampler
+       - |emitter|
+       - Nested plugin that chooses the candidates: ``nvc_lights``, ``power_lights`` or ``uniform_lights``. (Default:
+         none, see ``candidates``)
+     * - history
+       - |float|
+       - Confidence of what was kept in the frame before, in frames, at most; 0: no reuse over frames. (Default: 20)
+     * - spatial_samples
+       - |int|
+       - Neighbours that a pixel looks at; 0: no reuse over pixels. (Default: 4)
+     * - spatial_radius
+       - |float|
+       - They lie in a disk of this radius, in pixels. (Default: 32)
+     * - normal_threshold
+       - |float|
+       - Smallest cosine between the normals of two surfaces that share samples. (Default: 0.9)
+     * - depth_threshold
+       - |float|
+       - Largest difference of their distances from the camera, relative. (Default: 0.1)
+     * - combination
+       - |string|
+       - ``unbiased`` or ``biased``, see above. (Default: unbiased)
+     * - hide_emitters
+       - |bool|
+       - Leave out what the camera sees of emitters directly. (Default: false)
+
+    State lives from call to call; another scene, sensor or film size starts anew, as ``reset()`` does by hand. A moved
+    or reshaped *object* leaves a trace that fades over ``history`` frames (type ``reset()``).
+
+    *Works with* all surfaces and emitters of Mitsuba, any reconstruction filter, RGB variants ``llvm_ad_rgb`` and
+    ``cuda_ad_rgb``. Motion is followed for pinhole cameras (``perspective``); other sensors look at the same pixel of
+    the frame before. *Leaves out* reflected light (use ``nirc``), mirrors and glass beyond the emission that they show
+    directly, media (use ``volpath``), nesting in ``aov`` or ``moment``, and films that do not fit memory at one sample
+    a pixel (some 300 bytes each).
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="restir_di">
+                <string name="combination" value="unbiased"/>
+                <emitter type="nvc_lights" name="light_sampler"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            integrator = mi.load_dict({"type": "restir_di", "candidates": "nvc"})
+            for frame in range(100):
+                image = mi.render(scene, integrator=integrator, spp=1, seed=frame)
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.hide = props.get("hide_emitters", False)
+        self.initial_candidates = props.get("initial_candidates", 8)
+        self.history = props.get("history", 20.0)
+        self.spatial_samples = props.get("spatial_samples", 4)
+        self.spatial_radius = props.get("spatial_radius", 32.0)
+        self.normal_threshold = props.get("normal_threshold", 0.9)
+        self.depth_threshold = props.get("depth_threshold", 0.1)
+        self.combination = props.get("combination", "unbiased")
+        self.light_sampler = light_sampler_of(props)
+        self.candidates = props.get("candidates", "light" if self.light_sampler is None else "nvc")
+        self.nvc_where = props.get("nvc_where", "everywhere")
+        self._check(self.initial_candidates >= 1,
+                    f"initial_candidates is {self.initial_candidates}; it must be at least 1")  # fmt: skip
+        self._check(self.history >= 0, f"history is {self.history}; give 0 (no reuse over frames) or more")
+        self._check(self.spatial_samples >= 0,
+                    f"spatial_samples is {self.spatial_samples}; give 0 (no reuse over pixels) or more")  # fmt: skip
+        self._check(self.spatial_radius > 0, f"spatial_radius is {self.spatial_radius}; it must be greater than 0")
+        self._check(-1 <= self.normal_threshold <= 1,
+                    f"normal_threshold is {self.normal_threshold}; it is a cosine, in [-1, 1]")  # fmt: skip
+        self._check(self.depth_threshold > 0, f"depth_threshold is {self.depth_threshold}; it must be greater than 0")
+        for key, allowed in (("combination", COMBINATIONS), ("candidates", CANDIDATES), ("nvc_where", NVC_WHERE)):
+            value = getattr(self, key)
+            self._check(value in allowed, f"{key} is '{value}'; give one of: {', '.join(allowed)}")
+        self._check(self.light_sampler is None or self.candidates == "nvc",
+                    "a light_sampler is nested but candidates is 'light', which does not ask it; "
+                    "set candidates to 'nvc' or leave the light_sampler out")  # fmt: skip
+        self.unbiased = self.combination == "unbiased"
+        self.state = _State()
+
+    def _check(self, ok: bool, message: str) -> None:
+        if not ok:
+            raise ValueError(f"restir_di: {message}")
+
+    def reset(self) -> None:
+        """Forget the frames before, and what a light sampler has learned. Compiled kernels are kept."""
+        self.state.reset()
+        if self.state.chooser is not None:
+            self.state.chooser.reset()
+
+    # -------------------------------------------------------------------------------------------------------------
+    # From frame to frame
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """The mean of the next `spp` frames (0: as many as the sampler's sample count says)."""
+        if isinstance(sensor, int):
+            n_sensors = len(scene.sensors())
+            if n_sensors:
+                self._check(0 <= sensor < n_sensors, f"there is no sensor {sensor}; the scene has {n_sensors}")
+            else:
+                check_scene(scene, "restir_di")
+            sensor = scene.sensors()[sensor]
+        self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
+        spp = spp or sensor.sampler().sample_count()
+        seed = int(seed[0]) if hasattr(seed, "__len__") else int(seed)
+        film = sensor.film()
+        with dr.suspend_grad():
+            film.prepare([])
+            block = film.create_block()
+            block.set_coalesce(False)
+            for _ in range(spp):
+                block.put(*self._next_frame(scene, sensor, seed))
+            film.put_block(block)
+            result = film.develop() if develop else mi.TensorXf()
+            if evaluate:
+                dr.eval(result)
+            return result
+
+    def _next_frame(self, scene, sensor, seed: int):
+        """Render one frame: (positions, values) for the film's block."""
+        s, film = self.state, sensor.film()
+        size = tuple(int(v) for v in film.crop_size())
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        box = film.rfilter().is_box_filter()
+        # The parts, not the scene, which may hold this integrator; they must live as long as the surfaces kept of them
+        key = (*scene.shapes(), *scene.emitters(), sensor, size, border)
+        if len(key) != len(s.key) or any(a is not b and a != b for a, b in zip(key, s.key, strict=True)):
+            check_scene(scene, "restir_di")
+            s.reset()
+            s.frames.clear()
+            s.key, s.freeze = key, can_freeze(sensor)
+
+        lights, facts = self._lights(scene, sensor)
+        camera, pinhole = _camera(sensor)
+        if s.past is None or s.past_power.table.n_lights != s.power.table.n_lights:
+            s.past = _nothing(np.prod([v + 2 * border for v in size]))
+            s.past_power, s.past_camera = s.power, camera
+        facts = (facts, _facts(s.past_power.table), pinhole, size, border, box)
+        if facts not in s.frames:
+            s.frames[facts] = dr.freeze(self._frame_of(size, border, box, pinhole), auto_opaque=False, enabled=s.freeze)
+        with undisturbed():
+            pos, values, s.past = s.frames[facts](
+                scene, sensor, lights, s.power, s.past_power, s.past, s.past_camera, mi.UInt32(seed & 0xFFFFFFFF),
+                dr.opaque(mi.UInt32, s.frame),
+            )  # fmt: skip
+        s.past_power, s.past_camera = s.power, camera
+        s.frame += 1
+        return pos, values
+
+    def _lights(self, scene, sensor):
+        """See that `state.power` is that of the scene now. Returns what chooses the candidates, and what a recorded
+        function takes for granted of it."""
+        s = self.state
+        if s.chooser is None:
+            s.chooser = self.light_sampler or mi.load_dict(
+                {"type": "nvc_lights" if self.candidates == "nvc" else "power_lights"}
+            )
+        lights = s.chooser.lights(scene, sensor)
+        if lights is None:  # a single light, which light samplers do not watch
+            table = LightTable(scene)
+            known = s.power.table.columns if s.power is not None else {}
+            same = known and all(np.array_equal(v, known[k]) for k, v in table.columns.items())
+            lights = s.power if same else PowerLights(table)
+        if s.power is None or s.power.table is not lights.table:
+            s.power = lights if isinstance(lights, PowerLights) else PowerLights(lights.table)
+        facts = (type(lights).__name__, _facts(lights.table), getattr(lights, "candidates", None))
+        if (g := getattr(lights, "groups", None)) is not None:
+            facts += (g.n_groups, tuple(g.kind), g.single, g.search_steps)
+        return lights, (*facts, getattr(lights, "field", None) is None)
+
+    # -------------------------------------------------------------------------------------------------------------
+    # One frame
+
+    def _frame_of(self, size, border, box, pinhole):
+        """A function that renders one frame, to be recorded."""
+        width, height = (v + 2 * border for v in size)
+
+        def render_frame(scene, sensor, lights, power, past_power, past, past_camera, seed, frame):
+            pixel = dr.arange(mi.UInt32, width * height)
+            scramble, _ = mi.sample_tea_32(pixel, seed, 4)
+            stream, _ = mi.sample_tea_32(seed, frame, 4)
+            sampler = PathSampler.make(pixel, stream ^ 0x5BF03635, index=frame, scramble=scramble)
+            film = sensor.film()
+            corner = mi.Point2f(mi.Float(pixel % width) - border, mi.Float(pixel // width) - border)
+            pos = corner + sampler.stratified_2d(0)
+            aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+            time = sensor.shutter_open()
+            if sensor.shutter_open_time() > 0:
+                time += sampler.next_1d() * sensor.shutter_open_time()
+            ray, w_camera = sensor.sample_ray_differential(
+                time, sampler.next_1d(), pos / mi.Vector2f(mi.ScalarVector2f(size)), aperture
+            )
+
+            # ------------------- What the camera sees ---------------------
+            L, valid, si, usable = self.first_surface(scene, ray, sampler, power)
+            w_camera = mi.Color3f(w_camera)
+
+            # ------------- Where that was in the frame before -------------
+            before, found = self.reproject(si, past, past_camera, size, border, pixel, pinhole)
+            found &= usable
+
+            # ----------------- Initial candidates, one ray ----------------
+            kept = self.initial(scene, lights, power, si, found, sampler, usable)
+
+            # --------------------- Reuse over frames ----------------------
+            if self.history > 0:
+                kept = self.reuse_frame(scene, power, past_power, si, kept, past, before, found, sampler)
+            dr.eval(kept, si, usable, L, valid, w_camera, pos, sampler)
+
+            # --------------------- Reuse over pixels ----------------------
+            if self.spatial_samples > 0:
+                kept = self.reuse_pixels(scene, power, si, kept, usable, pixel, width, height, sampler)
+
+            # -------------------------- Shade -----------------------------
+            f, p_light = self.contribution(scene, power, si, kept.index, kept.uv, usable & (kept.W > 0))
+            shown = usable & (kept.W > 0)
+            if not self.unbiased:  # else the target knows it
+                shown &= _visible(scene, si, p_light, shown)
+            L = w_camera * (L + vertex.finite(f * kept.W, shown))
+            ok = dr.all(dr.isfinite(L))
+            L = dr.select(ok, L, 0)
+            values = [L.x, L.y, L.z]
+            if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+                values.append(dr.select(valid, mi.Float(1), 0))
+            values.append(dr.select(ok, mi.Float(1), 0))
+            pos = (corner + 0.5 if box else pos) + mi.Point2f(film.crop_offset())
+            past = Past(kept, si, usable)
+            dr.eval(pos, values, past)
+            return pos, values, past
+
+        return render_frame
+
+    def first_surface(self, scene, ray, sampler, power):
+        """What the camera sees: emission, and that which a BSDF ray meets, weighted against light samples.
+
+        Returns (radiance so far, valid, surface, whether it takes light samples).
+        """
+        ray = mi.RayDifferential3f(ray)
+        if self.hide:
+            pi = self.skip_area_emitters(scene, mi.Ray3f(ray), True, mi.Bool(True))
+            si = pi.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, mi.Bool(True))
+            L, valid = mi.Color3f(0), si.is_valid()
+        else:
+            si = scene.ray_intersect(ray)
+            L = vertex.emission(scene, si, mi.Bool(True))
+            valid = si.is_valid() | (si.emitter(scene) != None)  # noqa: E711
+        active = si.is_valid()
+        bsdf = si.bsdf(ray)
+        bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+        weight = vertex.finite(weight, active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        followed = active & (dr.max(weight) > 0)
+        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
+        table = power.table
+        hit, emits = table.index_of(scene, si_next, followed)
+        ds = mi.DirectionSample3f(scene, si_next, vertex.reference_point(si.p, si.n))
+        pdf_light = table.pdf(scene, si, hit, si_next, ds, emits & ~delta)
+        share = dr.select(delta, 1, 1 - self.light_share(power, hit, pdf_light, bs.pdf, emits))
+        L += dr.select(emits, weight * si_next.emitter(scene, emits).eval(si_next, emits) * share, 0)
+        return L, valid, _slim(si), active & vertex.has_smooth(bsdf)
+
+    def light_share(self, power, index, pdf, pdf_bsdf, active):
+        """Share of light samples in what reaches a surface from a point on light `index`; the rest is the BSDF ray's.
+
+        A fixed partition of the light, however lights are sampled: `initial_candidates` of them in proportion to power
+        against one of the BSDF (Veach 1997, eq. 9.13).
+        """
+        pmf = power.pmf(None, None, None, index, active)
+        return vertex.mis_weight(self.initial_candidates * pmf * pdf, pdf_bsdf)
+
+    def contribution(self, scene, power, si, index, uv, active):
+        """What a light sample gives, shadows apart: (share times f Le cos over the density of `uv`, point on it)."""
+        ds, weight, pdf = power.table.sample(scene, si, index, uv, active)
+        active = active & (pdf > 0)
+        f, pdf_bsdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        share = dr.select(ds.delta, 1, self.light_share(power, index, pdf, pdf_bsdf, active))
+        return vertex.finite(f * weight * share, active), ds.p
+
+    def target(self, scene, power, si, index, uv, active):
+        """What light samples are kept in proportion to: the mean of the channels, of visible ones if `unbiased`."""
+        f, p_light = self.contribution(scene, power, si, index, uv, active)
+        value = dr.mean(f)
+        if self.unbiased:
+            value = dr.select(_visible(scene, si, p_light, active & (value > 0)), value, 0)
+        return value
+
+    def initial(self, scene, lights, power, si, found, sampler, active) -> Reservoir:
+        """A reservoir of this frame's own candidates, confidence 1; its W is 0 where the kept one is in shadow.
+
+        E[g W] = integral of g over what is visible (Bitterli et al. 2020, alg. 3; visibility as in alg. 5).
+        """
+        n_candidates = self.initial_candidates
+        n, transmits = vertex.receiver(si, si.bsdf())
+
+        def draw(lights, active):
+            lights = _remembering(lights, si, n, transmits, active)
+
+            def candidate(i, kept, sampler):
+                u = (mi.Float(i) + sampler.next_1d()) * (1 / n_candidates)
+                choice = lights.choose(si, n, transmits, u, sampler, mi.UInt32(0), active)
+                uv = sampler.next_2d()
+                f, _ = self.contribution(scene, power, si, choice.index, uv, active & (choice.weight > 0))
+                target = dr.mean(f)
+                kept = reservoir.update(kept, choice.index, uv, target * choice.weight, target, sampler.next_1d())
+                return i + 1, kept, sampler
+
+            return dr.while_loop(
+                (mi.UInt32(0), Reservoir.empty(dr.width(si)), sampler), lambda i, *_: active & (i < n_candidates),
+                candidate, label="initial candidates",
+            )[1]  # fmt: skip
+
+        if self.candidates == "nvc" and self.nvc_where == "disoccluded":
+            kept, other = draw(power, active & found), draw(lights, active & ~found)
+            kept = dr.select(found, kept, other)
+        else:
+            kept = draw(lights, active)
+        kept = replace(reservoir.finish(kept), M=dr.select(active, mi.Float(1), 0))
+        lit = active & (kept.W > 0)
+        _, p_light = self.contribution(scene, power, si, kept.index, kept.uv, lit)
+        lit &= _visible(scene, si, p_light, lit)
+        return replace(kept, W=dr.select(lit, kept.W, 0), target=dr.select(lit, kept.target, 0))
+
+    def reproject(self, si, past, past_camera, size, border, pixel, pinhole):
+        """Pixel of the frame before that saw the point `si`: (its number, whether it did)."""
+        to_film, origin = past_camera
+        before, inside = pixel, mi.Bool(True)
+        distance = dr.norm(si.p - origin)
+        if pinhole:
+            film = to_film @ mi.Vector3f(si.p - origin)
+            inv_z = dr.rcp(dr.select(film.z > 0, film.z, 1))
+            x, y = film.x * inv_z * size[0] + border, film.y * inv_z * size[1] + border
+            width, height = (n + 2 * border for n in size)
+            inside = (film.z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+            before = mi.UInt32(dr.select(inside, x, 0)) + mi.UInt32(dr.select(inside, y, 0)) * width
+        there = dr.gather(mi.SurfaceInteraction3f, past.surface, before, inside)
+        inside &= dr.gather(mi.Bool, past.usable, before, inside)
+        return before, inside & self.alike(si, distance, there, dr.norm(there.p - origin))
+
+    def alike(self, a, distance_a, b, distance_b):
+        """Whether two surfaces may share light samples: their normals and distances from the camera are close."""
+        facing = dr.dot(_facing(a), _facing(b)) >= self.normal_threshold
+        return facing & (dr.abs(distance_a - distance_b) <= self.depth_threshold * distance_a)
+
+    def reuse_frame(self, scene, power, past_power, si, kept, past, before, found, sampler) -> Reservoir:
+        """Combine with what the pixel `before` kept in the last frame."""
+        old = reservoir.clamp_history(past.kept.at(before, found), self.history)
+        target = self.target(scene, power, si, old.index, old.uv, found & (old.W > 0))
+        us = [sampler.next_1d(), sampler.next_1d()]
+        if not self.unbiased:
+            return reservoir.combine([kept, old], [kept.target, target], us)
+        si_old = dr.gather(mi.SurfaceInteraction3f, past.surface, before, found)
+        swapped = self.target(scene, past_power, si_old, kept.index, kept.uv, found & (kept.W > 0))
+        shares = [reservoir.balance(kept.M, kept.target, old.M, swapped),
+                  reservoir.balance(old.M, old.target, kept.M, target)]  # fmt: skip
+        return reservoir.combine([kept, old], [kept.target, target], us, shares)
+
+    def reuse_pixels(self, scene, power, si, kept, usable, pixel, width, height, sampler) -> Reservoir:
+        """Combine with what pixels nearby kept, by defensive pairwise weights (biased: by 1/M)."""
+        n = self.spatial_samples
+
+        def neighbour(i, total, own_share, sampler):
+            offset = mi.warp.square_to_uniform_disk(sampler.next_2d()) * self.spatial_radius
+            x = mi.Int32(pixel % width) + mi.Int32(dr.round(offset.x))
+            y = mi.Int32(pixel // width) + mi.Int32(dr.round(offset.y))
+            near = usable & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+            lane = mi.UInt32(dr.select(near, x + y * width, 0))
+            near &= (lane != pixel) & dr.gather(mi.Bool, usable, lane, near)
+            si_near = dr.gather(mi.SurfaceInteraction3f, si, lane, near)
+            near &= self.alike(si, si.t, si_near, si_near.t)
+            other = kept.at(lane, near)
+
+            target = self.target(scene, power, si, other.index, other.uv, near & (other.W > 0))
+            share = other.M
+            if self.unbiased:
+                swapped = self.target(scene, power, si_near, kept.index, kept.uv, near & (kept.W > 0))
+                share, _ = reservoir.pairwise(other.M, other.target, kept.M, target, n)
+                own_share += reservoir.pairwise(other.M, swapped, kept.M, kept.target, n)[1]
+            total = reservoir.merge(total, other, target, share, sampler.next_1d())
+            return i + 1, total, own_share, sampler
+
+        _, total, own_share, sampler = dr.while_loop(
+            (mi.UInt32(0), Reservoir.empty(dr.width(pixel)), mi.Float(kept.M), sampler),
+            lambda i, *_: usable & (i < n), neighbour, label="neighbours",
+        )  # fmt: skip
+        return reservoir.finish(reservoir.merge(total, kept, kept.target, own_share, sampler.next_1d()))
+
+    # -------------------------------------------------------------------------------------------------------------
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        raise RuntimeError("restir_di renders whole frames and cannot be nested in another integrator; use plain_path")
+
+    def aov_names(self):
+        return []
+
+    def to_string(self):
+        return (
+            f"ReSTIRDirectIntegrator[\n  candidates = {self.candidates} ({self.initial_candidates}),\n"
+            f"  history = {self.history},\n  spatial_samples = {self.spatial_samples} in {self.spatial_radius} px,\n"
+            f"  combination = {self.combination},\n  frames = {self.state.frame}\n]"
+        )
+
+
+def _visible(scene, si, p_light, active):
+    """Whether nothing stands between a surface and a point on a light; false where not `active`."""
+    return active & ~scene.ray_test(si.spawn_ray_to(p_light), active)
+
+
+def _facing(si):
+    """Shading normal on the side that the surface is seen from."""
+    return dr.mulsign(mi.Vector3f(si.sh_frame.n), si.wi.z)
+
+
+def _slim(si):
+    """A copy of what BSDFs and light samples ask of a surface; the rest is 0 and takes no memory."""
+    slim = dr.zeros(mi.SurfaceInteraction3f, dr.width(si))
+    for name in ("t", "p", "n", "uv", "sh_frame", "dp_du", "dp_dv", "wi", "shape", "prim_index"):
+        setattr(slim, name, getattr(si, name))
+    return slim
+
+
+def _nothing(n: int) -> Past:
+    """A past in which nothing was seen."""
+    past = Past(Reservoir.empty(n), dr.zeros(mi.SurfaceInteraction3f, n), dr.zeros(mi.Bool, n))
+    kept = past.kept
+    slim = past.surface
+    dr.make_opaque(kept, past.usable, slim.t, slim.p, slim.n, slim.uv, slim.sh_frame, slim.dp_du, slim.dp_dv, slim.wi,
+                   slim.shape, slim.prim_index)  # fmt: skip
+    return past
+
+
+def _facts(table) -> tuple:
+    """What a recorded function takes for granted of a light table."""
+    return (table.n_lights, table.any_flat, table.all_flat, table.all_plain, tuple(table.kinds))
+
+
+def _remembering(lights, si, n, transmits, active):
+    """The same choice of lights at the same surface, again and again; a network is asked once, where `active`."""
+    if not hasattr(lights, "weights"):
+        return lights
+    weights = dr.if_stmt(
+        (si.p, n, transmits), active, lambda *at: tuple(lights.weights(*at)),
+        lambda *_: (mi.Float(0),) * lights.groups.n_groups, label="light weights",
+    )  # fmt: skip
+    lights = copy.copy(lights)
+    lights.weights = lambda *_: weights
+    return lights
+
+
+def _camera(sensor) -> tuple:
+    """((matrix, eye), pinhole): the matrix takes ``p - eye`` to the film, (x, y, 1) z with x and y in [0, 1].
+
+    Found from rays through the film's corners, so that it holds for any pinhole camera, shifted ones too; `pinhole` is
+    false where the rays do not meet or a further one disagrees, and the matrix then means nothing.
+    """
+    x, y = np.array([0, 1, 0, 1, 0.3], np.float32), np.array([0, 0, 1, 1, 0.6], np.float32)
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
+    d = np.array(ray.d + dr.zeros(mi.Vector3f, 5), np.float64)
+    o = np.array(ray.o + dr.zeros(mi.Point3f, 5), np.float64)
+    to_film, eye, pinhole = np.eye(3), o.mean(axis=1), False
+    # The point nearest to all rays: they start on the near plane
+    across = np.eye(3)[None] - np.einsum("ir,jr->rij", d, d)
+    if np.linalg.matrix_rank(across.sum(axis=0), tol=1e-6) == 3 and np.linalg.matrix_rank(d[:, 1:4], tol=1e-6) == 3:
+        eye = np.linalg.solve(across.sum(axis=0), np.einsum("rij,jr->i", across, o))
+        # Corners of a parallelogram: d0 + l3 d3 = l1 d1 + l2 d2
+        l1, l2, l3 = np.linalg.solve(np.stack([d[:, 1], d[:, 2], -d[:, 3]], axis=1), d[:, 0])
+        basis = np.stack([l1 * d[:, 1] - d[:, 0], l2 * d[:, 2] - d[:, 0], d[:, 0]], axis=1)
+        if min(l1, l2, l3) > 0 and np.linalg.matrix_rank(basis, tol=1e-6) == 3:
+            to_film = np.linalg.inv(basis)
+            a, b, c = to_film @ d[:, 4]
+            miss = np.abs(np.einsum("rij,jr->ir", across, o - eye[:, None])).max()
+            pinhole = bool(c > 0 and abs(a / c - 0.3) < 1e-3 and abs(b / c - 0.6) < 1e-3
+                           and miss <= 1e-4 * (1 + np.abs(o).max()))  # fmt: skip
+    # Matrices of Dr.Jit are written row by row
+    matrix = mi.Matrix3f(to_film.tolist())
+    eye = mi.Point3f(*eye.tolist())
+    dr.make_opaque(matrix, eye)
+    return (matrix, eye), pinhole
+
+
+mi.register_integrator("restir_di", lambda props: ReSTIRDirectIntegrator(props))

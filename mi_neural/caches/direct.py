@@ -1,0 +1,152 @@
+"""NRC-DI: direct light as a radiance cache has it, the baseline that the visibility cache is compared with.
+
+The network of the visibility cache with three outputs, the colours of what a surface of albedo 1 reflects of all
+lights, and a leaky ReLU in place of the sigmoid; learned from one sample of direct light per training point (the
+seed's paper on visibility caches, "NRC DI"). It depends on position alone: where surfaces meet, and on glossy ones, it
+blurs what the visibility cache keeps apart.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.freezing import can_freeze, undisturbed
+from . import encoding, loss
+from .field import Field, FieldShape
+
+#: Slope of the output below 0.
+LEAK = 0.01
+#: Targets above this many times the scene's mean are cut.
+TARGET_MAX = 1e4
+#: Albedos below this count as this, so that no target is divided by 0.
+ALBEDO_MIN = 0.05
+#: Of a field that knows no direction: `direction_degree` 0 is one constant input.
+NOWHERE = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class DirectTraining:
+    """Constants of training.
+
+    n_points                points per step, one sample of direct light each
+    epsilon                 of the relative loss, over the squared mean target
+    ema_decay               longest horizon of the averaged weights that queries use: 1 / (1 - ema_decay) steps
+    first_rate, last_rate   learning rates of Adam; the rate falls linearly
+    ramp                    over so many steps
+    """
+
+    n_points: int = 8192
+    epsilon: float = 0.1
+    ema_decay: float = 0.98
+    first_rate: float = 0.02
+    last_rate: float = 0.002
+    ramp: int = 200
+
+    def __post_init__(self):
+        if self.n_points < 4:
+            raise ValueError(f"n_points is {self.n_points}; it must be at least 4")
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        return self.first_rate + (self.last_rate - self.first_rate) * min(step / max(self.ramp, 1), 1.0)
+
+    def decay(self, step: int) -> float:
+        """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
+        return min(self.ema_decay, 1 - 1 / (step / 3 + 1))
+
+
+def albedo(si, bsdf, active):
+    """The factor that is taken out of the cached radiance; any positive one is right if it is always the same."""
+    diffuse = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+    value = bsdf.eval_diffuse_reflectance(si, diffuse)
+    return dr.select(diffuse & dr.all(dr.isfinite(value)), dr.clip(value, ALBEDO_MIN, 1), 1)
+
+
+class DirectCache:
+    """A field of reflected direct light together with its training.
+
+    ``trace(scene, sensor, lights, n, seed)`` gives training points: (position, target, valid), the target being
+    reflected direct light over :func:`albedo`.
+    """
+
+    def __init__(self, trace: Callable, training: DirectTraining | None = None, seed: int = 0):
+        self.trace, self.training, self.seed = trace, training or DirectTraining(), seed
+        self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
+        self._sensor_freezes: dict[int, bool] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all that was learned."""
+        self.field: Field | None = None
+        self.steps = 0
+        self.statistics = {"direct_steps": 0, "direct_loss": math.nan, "seconds_direct": 0.0}
+
+    def query(self, x):
+        """Reflected direct light at x of a surface of albedo 1, never negative."""
+        return self.field.query(self.field.encode(x), mi.Vector3f(*NOWHERE))
+
+    def start(self, scene, sensor, lights) -> None:
+        """Measure where light is asked for and how bright it is, and make the field; no training."""
+        with dr.suspend_grad():
+            seed = dr.opaque(mi.UInt32, self._seed(0xFFFFFF))
+            x, y, valid = self.trace(scene, sensor, lights, self.training.n_points, seed)
+            dr.eval(x, y, valid)
+        valid = np.array(valid)
+        level = np.array(y).mean(axis=0)[valid]
+        box = scene.bbox()
+        low, high = encoding.record_box(np.array(x).T[valid], np.array(box.min).ravel(), np.array(box.max).ravel())
+        scale = float(level.mean()) if level.size else 0.0
+        if not (math.isfinite(scale) and scale > 1e-30):
+            scale = 1e-20
+        shape = FieldShape(
+            n_levels=8, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.5, direction_degree=0,
+            width=32, n_hidden=2, leak=0.01,
+        )  # fmt: skip
+        self.field = Field(low, high, shape, scale=scale, seed=self.seed)
+        dr.eval(self.field)
+
+    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
+        training = self.training
+        with dr.suspend_grad():
+            x, y, valid = self.trace(scene, sensor, lights, training.n_points, seed)
+            y = dr.select(valid, dr.clip(y / field.scale, 0, TARGET_MAX), 0)
+            dr.eval(x, y, valid)
+            n_valid = dr.maximum(dr.count(valid), 1)
+            field.mean = dr.lerp(dr.sum(loss.luminance(y)) / n_valid, field.mean, decay)
+            dr.eval(field.mean)
+        p = field.predict(x, mi.Vector3f(*NOWHERE))
+        p = dr.select(p > 0, p, LEAK * p)
+        epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
+        total = dr.sum(dr.select(valid, loss.relative_l2(p, y, epsilon), 0)) / n_valid
+        field.step(total, learning_rate, decay)
+        return dr.detach(total)
+
+    def train(self, scene, sensor, lights, steps: int = 1) -> None:
+        """So many steps, each on fresh points."""
+        t0 = time.perf_counter()
+        if self.field is None:
+            self.start(scene, sensor, lights)
+        if id(sensor) not in self._sensor_freezes:
+            self._sensor_freezes[id(sensor)] = can_freeze(sensor)
+        frame = self._frame if self._sensor_freezes[id(sensor)] else self._frame_plain
+        for _ in range(steps):
+            with undisturbed():
+                value = frame(scene, sensor, lights, self.field, dr.opaque(mi.UInt32, self._seed(self.steps)),
+                              dr.opaque(mi.Float, self.training.rate(self.steps)),
+                              dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
+            self.steps += 1
+            self.field.steps = self.steps
+        if steps:
+            self.statistics["direct_loss"] = value[0]
+        self.statistics["direct_steps"] += steps
+        self.statistics["seconds_direct"] += time.perf_counter() - t0
+
+    def _seed(self, step: int) -> int:
+        return int(np.random.SeedSequence((self.seed, 0xD12EC7, step)).generate_state(1)[0])

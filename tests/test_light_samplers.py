@@ -1,0 +1,629 @@
+"""Light samplers inside integrators: images, changes of the scene, the visibility cache, refusals.
+
+Images are compared with Mitsuba's `path` by z-tests that fail a correct sampler in one of 10,000 choices of seed.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from expectation import assert_same_mean, renders
+from test_lights import glow, picture, random_triangles, triangles
+from test_vertex import lights, test_scene
+
+from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining
+from mi_neural.lights.clusters import make_groups
+from mi_neural.lights.table import LightTable
+
+SAMPLERS = {
+    "uniform": {"type": "uniform_lights"},
+    "power": {"type": "power_lights"},
+    "trained": {"type": "nvc_lights", "train_frames": 30, "train_steps": 0, "train_samples": 1024},
+    "untrained": {"type": "nvc_lights", "train_frames": 0, "train_steps": 0, "train_samples": 64},
+    "unshadowed": {"type": "nvc_lights", "visibility": False},
+    "clusters": {"type": "nvc_lights", "outputs": 8, "clusters": "kmeans", "train_frames": 20, "train_steps": 0,
+                 "train_samples": 512},
+}  # fmt: skip
+
+
+def path_with(sampler, depth=2):
+    given = SAMPLERS[sampler] if isinstance(sampler, str) else sampler
+    return mi.load_dict({"type": "plain_path", "max_depth": depth, "light_sampler": given})
+
+
+def at(*position):
+    return mi.ScalarTransform4f().translate(list(position))
+
+
+def many(kind: str, folder) -> dict:
+    """Lights over and between the spheres of `test_scene`."""
+    rng = np.random.default_rng(3)
+    if kind == "two":
+        return {"a": lights("area")["lamp"], "b": {"type": "point", "position": [-1.5, 1.5, 1.5], "intensity": 2.0}}
+    if kind == "kinds":
+        torch = mi.ScalarTransform4f().look_at([2, 3, 2], [0, 0, 0], [0, 1, 0])
+        return {
+            **lights("all"),
+            "ball": {"type": "sphere", "center": [-2, 1.5, -1], "radius": 0.3, "emitter": glow(4.0)},
+            "tube": {"type": "cylinder", "p0": [-1, 1.8, -2], "p1": [1, 1.8, -2], "radius": 0.1, "emitter": glow(3.0)},
+            "plate": {"type": "disk", "to_world": at(2, 1, -1).rotate([0, 1, 0], -60).scale(0.5), "emitter": glow(3.0)},
+            "torch": {"type": "spot", "to_world": torch, "intensity": 15.0},
+            "sun": {"type": "directional", "direction": [1.0, -2.0, 0.5], "irradiance": 0.5},
+            "mirrored": {"type": "rectangle", "to_world": at(0, 1, -2.5).scale([-0.5, 0.5, 1]), "emitter": glow(2.0)},
+        }  # fmt: skip
+    if kind == "32":
+        out = {}
+        for k in range(32):
+            p = rng.uniform([-2.5, 0.3, -2.5], [2.5, 2, 2.5])
+            out[f"l{k}"] = {"type": "rectangle", "to_world": at(*p).rotate([1, 0, 0], 90).scale(0.1),
+                            "emitter": glow(float(rng.uniform(5, 40)))}  # fmt: skip
+        return out
+    if kind == "mesh":
+        corners = random_triangles(rng, 256, center=(0, 2, 0), spread=0.6, size=0.1)
+        return {"m": {**triangles(folder / "m.ply", corners), "emitter": glow(6.0)}}
+    if kind == "spotted":
+        spot = np.full((64, 64, 3), 0.5, np.float32)
+        spot[8:12, 8:12] = 300
+        return {"a": {**lights("area")["lamp"], "emitter": glow(picture(spot))},
+                "b": {"type": "point", "position": [-1.5, 1.5, 1.5], "intensity": 2.0}}  # fmt: skip
+    return lights(kind)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """`place(kind, depth)`: a scene and images of `path` of it."""
+    known, folder = {}, tmp_path_factory.mktemp("meshes")
+
+    def get(kind, depth=2):
+        if kind not in known:
+            known[kind] = test_scene(many(kind, folder), 12)
+        if (kind, depth) not in known:
+            known[kind, depth] = renders(known[kind], {"type": "path", "max_depth": depth}, 16, 256, first_seed=1000)
+        return known[kind], known[kind, depth]
+
+    return get
+
+
+# ---------------------------------------------------------------- images
+
+
+@pytest.mark.parametrize("kind, name", [
+    *[("two", name) for name in ("power", "trained")],
+    *[("kinds", name) for name in ("uniform", "trained", "untrained", "clusters")],
+    *[("32", name) for name in ("trained", "clusters")],
+    *[("mesh", name) for name in ("power", "clusters")],
+    *[("spotted", name) for name in ("uniform", "trained")],
+])  # fmt: skip
+def test_image_is_that_of_path(place, kind, name):
+    scene, path = place(kind)
+    assert_same_mean(renders(scene, path_with(name), 16, 256), path, f"{kind}, {name}", relative=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["trained", "clusters"])
+def test_image_of_longer_paths_is_that_of_path(place, name):
+    scene, path = place("kinds", 4)
+    assert_same_mean(renders(scene, path_with(name, 4), 16, 128), path, name, relative=1e-5)
+
+
+@pytest.mark.parametrize("kind, nonsense", [("kinds", "random"), ("two", "NaN"), ("32", "inverted")])
+def test_network_that_says_nonsense_gives_the_same_image(place, kind, nonsense):
+    scene, path = place(kind)
+    integrator = path_with("trained")
+    sampler = integrator.light_sampler
+    lights = sampler.lights(scene, scene.sensors()[0])
+    weights = lights.field.weights
+    rng = np.random.default_rng(1)
+    parameters = {k: np.array(v) for k, v in weights.parameters().items()}
+    if nonsense == "inverted":
+        field = lights.field
+        lights.field = type("Inverted", (), {"query": lambda self, x: [1 - v for v in field.query(x)]})()
+        sampler.train = lambda scene, sensor: None
+    else:
+        scale = {"random": 30.0, "NaN": np.nan}[nonsense]
+        new = {k: rng.normal(size=v.shape).astype(v.dtype) * np.array(scale, v.dtype) for k, v in parameters.items()}
+        weights.assign({k: type(v)(new[k]) for k, v in weights.parameters().items()})
+        weights.pack()
+    # Weights of 30 are sure of themselves: noise of up to 1/0.03
+    assert_same_mean(renders(scene, integrator, 24, 64), path, f"{kind}, {nonsense}", relative=1e-5)
+
+
+@pytest.mark.parametrize("name", ["unshadowed"])
+def test_light_of_mesh_attributes_is_that_of_bsdf_samples_alone(tmp_path, name):
+    """Mitsuba 3.9.1's next-event estimation loses such light: compared with the paths that meet it by chance."""
+    rng = np.random.default_rng(2)
+    corners = random_triangles(rng, 24, center=(0, 2, 0), spread=0.8, size=0.5)
+    mesh = triangles(tmp_path / "m.ply", corners, ("face_glow", rng.uniform(0, 6, (24, 3))))
+    mesh["emitter"] = glow({"type": "mesh_attribute", "name": "face_glow"})
+    scene = test_scene({"m": mesh}, 12)
+    known = renders(scene, BY_CHANCE, 24, 256, first_seed=1000)
+    assert_same_mean(renders(scene, path_with(name), 16, 64), known, name, relative=1e-5)
+
+
+BY_CHANCE = {"type": "by_chance"}
+
+
+class ByChance(mi.SamplingIntegrator):
+    """Direct light of BSDF samples alone."""
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        si = scene.ray_intersect(ray, active)
+        L = si.emitter(scene, active).eval(si, active)
+        active = active & si.is_valid()
+        bs, weight = si.bsdf(ray).sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
+        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active)
+        return (
+            L + dr.select(active, weight * si_next.emitter(scene, active).eval(si_next, active), 0),
+            mi.Bool(True),
+            [],
+        )
+
+    def to_string(self):
+        return "ByChance[]"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _registered():
+    mi.register_integrator("by_chance", lambda props: ByChance(props))
+
+
+@pytest.mark.parametrize("kind", ["area", "point", "envmap"])
+def test_single_light_costs_and_changes_nothing(kind):
+    scene = test_scene(lights(kind), 8)
+    plain = np.array(mi.load_dict({"type": "plain_path", "max_depth": 3}).render(scene, spp=16, seed=5))
+    for name in SAMPLERS:
+        integrator = path_with(name, 3)
+        assert integrator.light_sampler.lights(scene, scene.sensors()[0]) is None
+        np.testing.assert_array_equal(np.array(integrator.render(scene, spp=16, seed=5)), plain)
+        assert integrator.light_sampler.statistics() == {}
+
+
+def nirc(name, **keys):
+    return mi.load_dict(
+        {"type": "nirc", "cache_samples": 0, "light_samples": 2, "light_sampler": SAMPLERS[name], **keys}
+    )
+
+
+@pytest.mark.parametrize("name, depth", [("power", 2), ("clusters", 2), ("trained", 4)])
+def test_nirc_without_its_cache_is_path(place, name, depth):
+    scene, path = place("kinds", depth)
+    assert_same_mean(renders(scene, nirc(name, max_depth=depth), 16, 32), path, f"{name}, {depth}", relative=1e-5)
+
+
+@pytest.mark.slow
+def test_nirc_with_a_trained_cache_is_near_path(place):
+    """The cache is biased by a little; light lost or counted twice shows."""
+    scene, path = place("kinds", -1)
+    integrator = mi.load_dict({"type": "nirc", "train_samples": 512, "train_frames": 40, "train_steps": 0,
+                               "light_sampler": SAMPLERS["trained"]})  # fmt: skip
+    image = renders(scene, integrator, 4, 64)
+    print(f"{image.mean():.4f}, path {path.mean():.4f}")
+    assert image.mean() == pytest.approx(path.mean(), rel=0.03)
+
+
+@pytest.mark.parametrize("type_, name", [*[("plain_path", n) for n in SAMPLERS], ("nirc", "trained")])
+def test_lights_that_are_off_give_a_black_image(name, type_):
+    off = {"a": {"type": "point", "position": [0, 2, 0], "intensity": 0.0},
+           "b": {"type": "rectangle", "to_world": at(0, 2, 0).rotate([1, 0, 0], 90), "emitter": glow(0.0)}}  # fmt: skip
+    scene = test_scene(off, 8)
+    integrator = path_with(name, 3) if type_ == "plain_path" else nirc(name)
+    assert (np.array(integrator.render(scene, spp=4)) == 0).all()
+
+
+def test_scene_without_lights_is_black_or_refused():
+    scene = test_scene({}, 8)
+    assert (np.array(path_with("trained").render(scene, spp=4)) == 0).all()
+    with pytest.raises(ValueError, match="the scene has no emitter"):
+        nirc("trained").render(scene, spp=4)
+
+
+def test_light_of_nan_harms_no_pixel_that_does_not_see_it():
+    """One light of three is not a number; the image elsewhere stays finite and lit by the others."""
+    three = {**many("two", None), "c": {"type": "point", "position": [0, 1, 3], "intensity": float("nan")}}
+    scene = test_scene(three, 8)
+    for name in ("power", "trained"):
+        image = np.array(path_with(name).render(scene, spp=64))
+        assert np.isfinite(image).all() and (image > 0).mean() > 0.5
+
+
+# ---------------------------------------------------------------- changes of the scene
+
+
+def shadow_scene(tmp_path=None):
+    return mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 4, 6], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(3)},
+        "spark": {"type": "point", "position": [0.0, 2.0, 0.0], "intensity": 1.0},
+        "torch": {"type": "spot", "to_world": mi.ScalarTransform4f().look_at([1, 2, 0], [0, 0, 0], [0, 0, 1]),
+            "intensity": 2.0},
+        "lamp": {"type": "rectangle", "to_world": at(0, 2, 1).rotate([1, 0, 0], 90).scale(0.2), "emitter": glow(3.0)},
+        "box": {"type": "cube", "to_world": at(-1, 2, -1).scale(0.1), "emitter": glow(2.0)},
+        "sky": {"type": "constant", "radiance": 0.2},
+        "sun": {"type": "directional", "direction": [0.3, -1.0, 0.2], "irradiance": 1.0},
+    })  # fmt: skip
+
+
+CHANGES = {
+    "spark.position": lambda v: mi.Point3f(0.5, 1.5, -0.5),
+    "spark.intensity.value": lambda v: mi.Color3f(7.0),
+    "torch.to_world": lambda v: mi.Transform4f().look_at([-1, 3, 0], [0, 0, 0], [0, 0, 1]),
+    "lamp.to_world": lambda v: mi.Transform4f().translate([0, 3, 1]).rotate([1, 0, 0], 90).scale(0.4),
+    "lamp.emitter.radiance.value": lambda v: mi.Float(9.0),
+    "box.vertex_positions": lambda v: v + 0.25,
+    "sky.radiance.value": lambda v: mi.Color3f(1.5),
+    "sun.to_world": lambda v: mi.Transform4f().look_at([0, 0, 0], [1, -1, 0], [0, 0, 1]),
+    "sun.irradiance.value": lambda v: mi.Color3f(4.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", CHANGES)
+def test_table_follows_a_light_that_changes(key):
+    scene = shadow_scene()
+    sampler = mi.load_dict({"type": "power_lights"})
+    before = sampler.lights(scene, scene.sensors()[0])
+    params = mi.traverse(scene)
+    params[key] = CHANGES[key](params[key])
+    params.update()
+    after = sampler.lights(scene, scene.sensors()[0])
+    known = LightTable(scene).columns
+    assert any(not np.array_equal(before.table.columns[k], v) for k, v in known.items())
+    for name, values in known.items():
+        np.testing.assert_allclose(after.table.columns[name], values, rtol=1e-6, err_msg=name)
+
+
+def test_table_follows_lights_that_change_several_times_between_images():
+    """A variable's number is free again once it is gone: the last value may bear the first one's."""
+    scene = shadow_scene()
+    sampler = mi.load_dict({"type": "power_lights"})
+    params = mi.traverse(scene)
+    for k in range(12):
+        for j in range(1 + k % 4):
+            params["spark.position"] = mi.Point3f(k, j, 3)
+            params["lamp.emitter.radiance.value"] = dr.opaque(mi.Float, 1.0 + 5 * k + j)
+            params["box.vertex_positions"] = params["box.vertex_positions"] + 0.01
+            params.update()
+        found, known = sampler.lights(scene, scene.sensors()[0]).table.columns, LightTable(scene).columns
+        for name in ("center", "intensity", "corner"):
+            np.testing.assert_allclose(found[name], known[name], rtol=1e-6, err_msg=f"{name}, round {k}")
+
+
+def test_table_follows_mesh_attributes(tmp_path):
+    rng = np.random.default_rng(0)
+    mesh = triangles(tmp_path / "m.ply", random_triangles(rng, 4), ("face_glow", np.ones((4, 3))))
+    mesh["emitter"] = glow({"type": "mesh_attribute", "name": "face_glow"})
+    scene = test_scene({"m": mesh}, 8)
+    sampler = mi.load_dict({"type": "power_lights"})
+    sampler.lights(scene, scene.sensors()[0])
+    params = mi.traverse(scene)
+    params["m.face_glow"] = mi.Float(np.arange(12, dtype=np.float32))
+    params.update()
+    found = sampler.lights(scene, scene.sensors()[0]).table.columns
+    np.testing.assert_allclose(found["radiance"].ravel(), np.arange(12), rtol=1e-5)
+
+
+def test_table_is_made_once_where_no_light_changes():
+    scene = shadow_scene()
+    sampler = mi.load_dict({"type": "power_lights"})
+    table = sampler.lights(scene, scene.sensors()[0]).table
+    integrator = mi.load_dict({"type": "plain_path", "max_depth": 2})
+    integrator.light_sampler = sampler
+    params = mi.traverse(scene)
+    for k in range(3):
+        integrator.render(scene, spp=1, seed=k)
+        params["floor.bsdf.reflectance.value"] = dr.opaque(mi.Float, 0.1 * k)
+        params["sensor.to_world"] = params["sensor.to_world"]
+        params.update()
+        assert sampler.lights(scene, scene.sensors()[0]).table is table
+
+
+def test_another_scene_is_learned_anew_even_where_the_first_is_gone():
+    sampler = mi.load_dict({"type": "power_lights"})
+    for k in range(1, 5):
+        scene = mi.load_dict({"type": "scene", "a": {"type": "point", "intensity": float(k)}, "b": {"type": "point"}})
+        assert sampler.lights(scene, None).table.columns["intensity"].max() == pytest.approx(k)
+        del scene
+
+
+@pytest.mark.parametrize("name", ["clusters"])
+def test_image_after_a_change_is_that_of_a_fresh_integrator(name):
+    """The pass is frozen: what it knows of lights must be recorded anew where it changes. The 24 triangles are grouped
+    otherwise once they move, and a lamp gets a picture that it had not."""
+    rng = np.random.default_rng(4)
+    text = picture(np.ones((16, 16, 3), np.float32))
+    lamp = {"type": "rectangle", "to_world": at(0, 2, 0).rotate([1, 0, 0], 90), "emitter": glow(text)}
+    more = {f"c{k}": {"type": "cube", "to_world": at(*rng.uniform([-2, 1, -2], [2, 2, 2])).scale(0.1),
+        "emitter": glow(5.0)}
+            for k in range(2)}  # fmt: skip
+    scene = test_scene({"lamp": lamp, **more}, 12)
+    integrator = nirc(name, max_depth=2)
+    for k in range(2):
+        integrator.render(scene, spp=256, seed=k)
+    params = mi.traverse(scene)
+    spot = np.full((16, 16, 3), 0.1, np.float32)
+    spot[2:5, 2:5] = 40
+    params["lamp.emitter.radiance.data"] = mi.TensorXf(spot)
+    p = np.array(params["c0.vertex_positions"]).reshape(-1, 3)
+    p[:5] += [2, 0, 1]
+    params["c0.vertex_positions"] = mi.Float(p.ravel())
+    params.update()
+    fresh = renders(scene, nirc(name, max_depth=2), 32, 256, first_seed=1000)
+    assert_same_mean(renders(scene, integrator, 32, 256), fresh, name, relative=1e-5)
+
+
+def test_frozen_pass_learns_that_groups_have_other_sizes(tmp_path):
+    """Two groups of 20 triangles become one of 39 and one of 1: the arrays keep their sizes, the search needs a step
+    more.
+    """
+    rng = np.random.default_rng(4)
+    corners = random_triangles(rng, 40, center=(0, 2, 0), spread=0.05, size=0.1)
+    corners[:20, :, 0] -= 1.5
+    corners[20:, :, 0] += 1.5
+    scene = test_scene({"m": {**triangles(tmp_path / "m.ply", corners), "emitter": glow(6.0)}}, 12)
+    sampler = {"type": "nvc_lights", "outputs": 2, "clusters": "kmeans", "visibility": False}
+    keys = {"type": "nirc", "cache_samples": 0, "light_samples": 1, "max_depth": 2, "light_sampler": sampler}
+    integrator = mi.load_dict(keys)
+    for k in range(3):
+        integrator.render(scene, spp=64, seed=k)
+    assert sorted(np.array(integrator.light_sampler.sampler.groups.count)) == [20, 20]
+    corners[:19, :, 0] += 3
+    params = mi.traverse(scene)
+    params["m.vertex_positions"] = mi.Float(corners.ravel())
+    params.update()
+    found = np.array(integrator.render(scene, spp=64, seed=9))
+    assert sorted(np.array(integrator.light_sampler.sampler.groups.count)) == [1, 39]
+    fresh = mi.load_dict(keys)
+    fresh.render(scene, spp=64, seed=8)
+    np.testing.assert_allclose(found, np.array(fresh.render(scene, spp=64, seed=9)), rtol=1e-4, atol=1e-6)
+
+
+# ---------------------------------------------------------------- the visibility cache
+
+
+def wall_scene():
+    """A floor, a wall at x = 0, a light on either side of it, and one above."""
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    wall = mi.ScalarTransform4f().translate([0, 1.5, 0]).scale([0.05, 1.5, 2])
+    return mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 60, "to_world": mi.ScalarTransform4f().look_at([0, 7, 0], [0, 0, 0],
+            [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+        "floor": {"type": "rectangle", "to_world": up.scale(2)},
+        "wall": {"type": "cube", "to_world": wall},
+        "left": {"type": "point", "position": [-1.5, 1, 0], "intensity": 1.0},
+        "right": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1.5, 1, 0]).scale(0.1),
+            "emitter": glow()},
+        "ball": {"type": "sphere", "center": [1.2, 1, 1], "radius": 0.3, "emitter": glow()},
+        "tube": {"type": "cylinder", "p0": [1, 0.5, -1], "p1": [1, 1.5, -1], "radius": 0.2, "emitter": glow()},
+    })  # fmt: skip
+
+
+def order(scene, table) -> list[str]:
+    names = [e.get_shape().id() if e.get_shape() else e.id() for e in scene.emitters()]
+    return [names[k] for k in table.columns["emitter"]]
+
+
+def known_visibility(scene, table, p: np.ndarray) -> np.ndarray:
+    """Share of each light's samples that are seen from the points (n, 3): (lights, n)."""
+    n, m = len(p), 64
+    si = dr.zeros(mi.SurfaceInteraction3f, n * m)
+    si.p = mi.Point3f(*np.repeat(p, m, axis=0).T)
+    u = mi.Point2f(*np.random.default_rng(0).random((2, n * m), np.float32))
+    out = []
+    for k in range(table.n_lights):
+        emitter = scene.emitters()[int(table.columns["emitter"][k])]
+        ds, _ = emitter.sample_direction(si, u)
+        distance = dr.norm(mi.Point3f(ds.p) - si.p)
+        ray = mi.Ray3f(si.p, ds.d)
+        ray.maxt = distance * (1 - 1e-3)
+        seen = ~scene.ray_test(ray)
+        out.append((np.array(seen) * np.ones(n * m)).reshape(n, m).mean(axis=1))
+    return np.array(out)
+
+
+@pytest.fixture(scope="module")
+def wall():
+    scene = wall_scene()
+    table = LightTable(scene)
+    cache = VisibilityCache(VisibilityTraining(n_points=4096))
+    losses = []
+    for _ in range(100):
+        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32))
+        losses.append(cache.statistics["visibility_loss"])
+    return scene, table, cache, losses
+
+
+def said(cache, p) -> np.ndarray:
+    return np.array([np.array(v) for v in cache.field.query(mi.Point3f(*np.asarray(p, np.float32).T))])
+
+
+def test_network_learns_which_side_of_a_wall_sees_a_light(wall):
+    scene, table, cache, _ = wall
+    rng = np.random.default_rng(1)
+    p = np.stack([rng.uniform(0.4, 1.8, 400), np.full(400, 0.01), rng.uniform(-1, 1, 400)], -1)
+    p[:200, 0] *= -1
+    found = dict(zip(order(scene, table), said(cache, p), strict=False))
+    left = p[:, 0] < 0
+    print({k: (f"{v[left].mean():.3f}", f"{v[~left].mean():.3f}") for k, v in found.items()})
+    assert found["left"][left].mean() > 0.95 and found["left"][~left].mean() < 0.05
+    assert found["right"][~left].mean() > 0.9 and found["right"][left].mean() < 0.05
+
+
+def test_network_has_a_small_error_for_lights_of_every_kind(wall):
+    """Spheres and cylinders hide their own middle, which is not to count as hidden. Of a cylinder Mitsuba samples the
+    far side as well, which the cylinder itself hides: its share lies below what can be seen."""
+    scene, table, cache, _ = wall
+    rng = np.random.default_rng(2)
+    p = np.stack(
+        [rng.uniform(0.3, 1.8, 300) * rng.choice([-1, 1], 300), np.full(300, 0.01), rng.uniform(-1.8, 1.8, 300)], -1
+    )
+    known, found = known_visibility(scene, table, p), said(cache, p)
+    error = dict(zip(order(scene, table), np.sqrt(((known > 0) - found).__pow__(2).mean(axis=1)), strict=False))
+    share = dict(zip(order(scene, table), (known > 0).mean(axis=1), strict=False))
+    print("rms errors", {k: f"{v:.3f} (of {share[k]:.2f})" for k, v in error.items()})
+    assert max(v for k, v in error.items() if k != "tube") < 0.1 and error["tube"] < 0.5
+
+
+def test_loss_falls(wall):
+    losses = np.array(wall[3])
+    print(f"first {losses[:3].mean():.3f}, last {losses[-10:].mean():.4f}")
+    assert losses[-10:].mean() < 0.2 * losses[:3].mean() and np.isfinite(losses).all()
+
+
+def test_statistics_count_the_steps(wall):
+    s = wall[2].statistics
+    assert s["visibility_steps"] == wall[2].steps == 100 and s["seconds_visibility"] > 0
+
+
+def test_equal_seeds_give_equal_weights_and_others_do_not():
+    scene = wall_scene()
+    table = LightTable(scene)
+
+    def weights(seed):
+        cache = VisibilityCache(VisibilityTraining(n_points=512), seed=seed)
+        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32), 8)
+        return {k: np.array(v, np.float64) for k, v in cache.field.weights.parameters().items()}
+
+    a, b, c = weights(1), weights(1), weights(2)
+    rms = [np.sqrt(np.mean(np.concatenate([(a[k] - x[k]).ravel() for k in a]) ** 2)) for x in (b, c)]
+    print(f"rms difference: equal seeds {rms[0]:.1e}, other seeds {rms[1]:.1e}")
+    assert rms[0] < 0.1 * rms[1]
+
+
+def test_number_of_recordings_is_constant_over_thirty_images():
+    scene = wall_scene()
+    integrator = mi.load_dict({
+        "type": "nirc", "train_samples": 256, "train_frames": 2, "light_samples": 1,
+        "light_sampler": {"type": "nvc_lights", "train_frames": 4, "train_samples": 256},
+    })  # fmt: skip
+    visibility = integrator.light_sampler.cache
+
+    def recordings():
+        return [integrator.cache._frame.n_recordings, visibility._frame.n_recordings,
+                *(p.n_recordings for p in integrator.state.passes.values())]  # fmt: skip
+
+    for k in range(5):
+        integrator.render(scene, spp=1, seed=k)
+    before, steps = recordings(), visibility.steps
+    for k in range(30):
+        integrator.render(scene, spp=1, seed=10 + k)
+    print(f"recordings {before}")
+    assert recordings() == before and max(before) <= 4 and visibility.steps == steps + 30
+
+
+def test_training_follows_its_keys():
+    scene = wall_scene()
+    for keys, known in (({"train_frames": 3, "train_steps": 2}, [3, 5, 7]), ({"train_frames": 3, "train_steps": 0},
+        [3, 3, 3]),
+                        ({"train_frames": 3, "freeze": True}, [0, 0, 0]), ({"train_frames": 0, "train_steps": 1}, [0,
+                            1, 2]),
+                        ({"visibility": False}, [0, 0, 0])):  # fmt: skip
+        integrator = path_with({"type": "nvc_lights", "train_samples": 64, **keys})
+        found = []
+        for k in range(3):
+            integrator.render(scene, spp=1, seed=k)
+            found.append(integrator.light_sampler.cache.steps)
+        assert found == known, keys
+
+
+def test_reset_forgets_what_was_learned():
+    scene = wall_scene()
+    integrator = path_with({"type": "nvc_lights", "train_samples": 64, "train_frames": 5})
+    integrator.render(scene, spp=1)
+    facts = integrator.light_sampler.statistics()
+    assert facts["lights"] == facts["light_groups"] == 4 and facts["visibility_steps"] == 5
+    integrator.light_sampler.reset()
+    assert integrator.light_sampler.cache.steps == 0
+    integrator.render(scene, spp=1)
+    assert integrator.light_sampler.cache.steps == 5
+
+
+def test_learned_visibility_lessens_the_noise_where_a_wall_stands_between_lights():
+    scene = wall_scene()
+    noise = {}
+    for name in ("uniform", "unshadowed", "trained"):
+        images = renders(scene, path_with(name), 16, 16)
+        noise[name] = np.sqrt(images.var(axis=0)).mean()
+    print({k: f"{v:.2e}" for k, v in noise.items()})
+    assert noise["trained"] < 0.9 * noise["unshadowed"] and noise["trained"] < 0.9 * noise["uniform"]
+
+
+def test_rate_and_decay_follow_their_schedule():
+    t = VisibilityTraining()
+    rates, decays = (np.array([f(k) for k in range(400)]) for f in (t.rate, t.decay))
+    assert rates[0] == 0.05 and rates[200] == rates[-1] == pytest.approx(0.001) and (np.diff(rates) <= 0).all()
+    assert decays[0] == 0 and decays[-1] == 0.9 and (np.diff(decays) >= 0).all()
+
+
+def test_orthographic_camera_that_cannot_be_frozen_works():
+    scene = mi.load_dict({
+        "type": "scene", "a": {"type": "point", "position": [0, 0, 3]}, "b": {"type": "point", "position": [1, 0, 3]},
+        "floor": {"type": "rectangle"},
+        "sensor": {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+    })  # fmt: skip
+    image = np.array(path_with({**SAMPLERS["trained"], "train_frames": 3}).render(scene, spp=4))
+    assert np.isfinite(image).all() and image.mean() > 0
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize("key, value", [
+    ("outputs", 1), ("outputs", 257), ("candidates", 0), ("train_frames", -1), ("train_steps", -1), ("train_samples",
+        3),
+    ("seed", -1), ("clusters", "median"),
+])  # fmt: skip
+def test_keys_out_of_range_are_refused_by_name(key, value):
+    with pytest.raises((ValueError, RuntimeError), match=f"nvc_lights: {key} is '?{value}'?"):
+        mi.load_dict({"type": "nvc_lights", key: value})
+
+
+@pytest.mark.parametrize("key, value", [
+    ("n_points", 3), ("ema_decay", -0.1), ("ema_decay", 1.1), ("ema_decay", float("nan")), ("first_rate", 0),
+        ("last_rate", -1),
+    ("last_rate", float("nan")),
+])  # fmt: skip
+def test_impossible_training_is_refused(key, value):
+    with pytest.raises(ValueError, match=str(value)):
+        VisibilityTraining(**{key: value})
+
+
+def test_unknown_keys_are_refused():
+    for type_ in ("uniform_lights", "power_lights", "nvc_lights"):
+        with pytest.raises(RuntimeError, match="outputz"):
+            mi.load_dict({"type": type_, "outputz": 3})
+
+
+@pytest.mark.parametrize("type_", ["plain_path", "nirc"])
+@pytest.mark.parametrize("given", [{"type": "point"}, {"type": "diffuse"}, "nvc_lights"])
+def test_what_is_no_light_sampler_is_refused(type_, given):
+    with pytest.raises((ValueError, RuntimeError), match=f"{type_}: light_sampler is not a light sampler; nest one"):
+        mi.load_dict({"type": type_, "light_sampler": given})
+
+
+def test_too_few_outputs_for_the_lights_are_refused_by_render():
+    scene = shadow_scene()
+    integrator = path_with({"type": "nvc_lights", "outputs": 2, "train_frames": 1})
+    with pytest.raises(ValueError, match=r"nvc_lights: 2 lights are at infinity.*2 outputs; raise outputs"):
+        integrator.render(scene, spp=1)
+    integrator = path_with({"type": "nvc_lights", "outputs": 5, "clusters": "emitter"})
+    with pytest.raises(ValueError, match=r"nvc_lights: there are 6 emitters.*5 outputs"):
+        integrator.render(scene, spp=1)
+
+
+def test_a_light_sampler_gives_no_light_where_it_stands_among_emitters():
+    lit = {**many("two", None), "sampler": {"type": "power_lights"}}
+    image = np.array(mi.load_dict({"type": "path", "max_depth": 2}).render(test_scene(lit, 8), spp=64))
+    assert np.isfinite(image).all() and image.mean() > 0
+
+
+def test_samplers_print_and_load_from_xml():
+    for name in ("uniform_lights", "power_lights", "nvc_lights"):
+        text = (
+            f'<integrator version="3.0.0" type="plain_path"><emitter type="{name}" name="light_sampler"/></integrator>'
+        )
+        integrator = mi.load_string(text)
+        assert "Sampler" in str(integrator.light_sampler)
