@@ -857,7 +857,8 @@ def test_extreme_lights_give_finite_probabilities(tmp_path, rng, intensity, size
     assert all(np.isfinite(v).all() for v in table.columns.values())
     samplers = [PowerLights(table), VisibleLights(table, make_groups(table, n_outputs, "kmeans"))]
     for sampler in samplers:
-        for p in (offset, offset + np.array([0.0, 0.0, 1.0]), offset + np.array([0.0, 0.0, 1e5]), table.columns["center"][3].astype(float)):
+        up = np.array([0.0, 0.0, 1.0])
+        for p in (offset, offset + up, offset + 1e5 * up, table.columns["center"][3].astype(float)):
             index, weight, pmf, pmf_hit = draws(sampler, p, [0, 0, 1], 64, hit=3)
             for value in (weight, pmf, pmf_hit):
                 assert np.isfinite(value).all() and (value >= 0).all()

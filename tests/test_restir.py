@@ -286,7 +286,7 @@ def test_bright_and_dim_lights_stay_finite():
     ("initial_candidates", 0, "initial_candidates is 0; it must be at least 1"),
     ("history", -1.0, "history is -1.0; give 0"),
     ("spatial_samples", -1, "spatial_samples is -1; give 0"),
-    ("spatial_radius", 0.0, "spatial_radius is 0.0; it must be greater than 0"),
+    ("spatial_radius", 0.0, "spatial_radius is 0.0; give -1"),
     ("normal_threshold", 1.5, "normal_threshold is 1.5; it is a cosine"),
     ("depth_threshold", 0.0, "depth_threshold is 0.0; it must be greater than 0"),
     ("combination", "fair", "combination is 'fair'; give one of: unbiased, biased"),

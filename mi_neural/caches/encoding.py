@@ -16,7 +16,9 @@ def to_unit_cube(p, box_min, box_inv_extent):
 
 
 def direction(w, degree: int) -> list:
-    """Real spherical harmonics up to `degree` of unit vectors: ``(degree + 1)^2`` values."""
+    """Real spherical harmonics up to `degree` of unit vectors: ``(degree + 1)^2`` values, none for -1."""
+    if degree < 0:
+        return []
     return dr.sh_eval(mi.Vector3f(w), degree)
 
 

@@ -220,7 +220,7 @@ class VisibilityCache:
         for _ in range(steps):
             seed = int(np.random.SeedSequence((self.seed, 0x7151B1E, self.steps)).generate_state(1)[0])
             with undisturbed():
-                loss = frame(scene, sensor, self.field, table, groups, mi.UInt32(seed),
+                loss = frame(scene, sensor, self.field, table, groups, dr.opaque(mi.UInt32, seed),
                              dr.opaque(mi.Float, self.training.rate(self.steps)),
                              dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
             self.steps += 1
