@@ -249,10 +249,10 @@ class CacheIntegrator(mi.SamplingIntegrator):
         if key != self.state.facts_key:
             self.state.facts, self.state.facts_key = {}, key
         if self.light_sampler is not None:
-            # An image that is rendered in several calls is one frame; settings are measured with what was learned at
-            # least once
+            # Settings are measured with lights chosen as they will be; an image rendered in several calls is one frame
+            learn = (train and not self.state.image_open) or not self.state.facts
             with dr.suspend_grad():
-                self.state.lights = self.light_sampler.lights(scene, sensor, train=train and not self.state.image_open)
+                self.state.lights = self.light_sampler.lights(scene, sensor, train=learn)
         if not self.needs_cache:
             if not self.state.facts:
                 self.settle(scene, sensor)
@@ -313,6 +313,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         sensor = self._sensor(scene, sensor)
         images, queries = self.state.images, self.state.queries
         untouched = self.cache.field is None
+        fresh_lights = self.light_sampler is not None and not self.light_sampler.statistics().get("visibility_steps")
         self._ready(scene, sensor, train=False)
         if self.needs_cache:
             state = None if untouched else self.cache.checkpoint()
@@ -328,6 +329,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 self.measure_query()
             self.cache.rollback(state)
         self.state.images, self.state.queries = images, queries
+        if fresh_lights:
+            self.light_sampler.reset()
 
     def statistics(self) -> dict:
         """Facts since the last reset: training (see :class:`IncidentCache`), queries, non-finite samples."""
