@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.lights.table import LightTable
+from mi_neural.transport.identity import SceneWatch
 
 
 class LightSampler(mi.Emitter):
@@ -19,7 +20,7 @@ class LightSampler(mi.Emitter):
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
-        self.scene, self.scene_key, self.held = None, None, None
+        self.scene, self.held = SceneWatch(), None
         self.watched: list = []
         self.sampler = None
 
@@ -51,10 +52,9 @@ class LightSampler(mi.Emitter):
 
         The table is made anew where the scene is another one, or its lights changed.
         """
-        key = (len(scene.shapes()), len(scene.emitters()))
-        if scene is not self.scene or key != self.scene_key:
+        if self.scene.changed(scene):
             self.reset()
-            self.scene, self.scene_key, self.held, self.sampler = scene, key, None, None
+            self.held, self.sampler = None, None
             self.watched = _watch(scene)
         if not self.watched:
             return None

@@ -20,6 +20,7 @@ import numpy as np
 from ..transport.freezing import can_freeze, undisturbed
 from . import encoding, loss
 from .field import Field, FieldShape
+from .schedule import Ramp
 
 #: Slope of the output below 0.
 LEAK = 0.01
@@ -27,39 +28,19 @@ LEAK = 0.01
 TARGET_MAX = 1e4
 #: Albedos below this count as this, so that no target is divided by 0.
 ALBEDO_MIN = 0.05
-#: Of a field that knows no direction: `direction_degree` 0 is one constant input.
-NOWHERE = (0.0, 0.0, 1.0)
-
 
 @dataclass(frozen=True)
-class DirectTraining:
-    """Constants of training.
+class DirectTraining(Ramp):
+    """Constants of training, see :class:`~mi_neural.caches.schedule.Ramp`; each point has one sample of direct light.
 
-    n_points                points per step, one sample of direct light each
-    epsilon                 of the relative loss, over the squared mean target
-    ema_decay               longest horizon of the averaged weights that queries use: 1 / (1 - ema_decay) steps
-    first_rate, last_rate   learning rates of Adam; the rate falls linearly
-    ramp                    over so many steps
+    epsilon    of the relative loss, over the squared mean target
     """
 
     n_points: int = 8192
-    epsilon: float = 0.1
     ema_decay: float = 0.98
     first_rate: float = 0.02
     last_rate: float = 0.002
-    ramp: int = 200
-
-    def __post_init__(self):
-        if self.n_points < 4:
-            raise ValueError(f"n_points is {self.n_points}; it must be at least 4")
-
-    def rate(self, step: int) -> float:
-        """Learning rate of a step."""
-        return self.first_rate + (self.last_rate - self.first_rate) * min(step / max(self.ramp, 1), 1.0)
-
-    def decay(self, step: int) -> float:
-        """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
-        return min(self.ema_decay, 1 - 1 / (step / 3 + 1))
+    epsilon: float = 0.1
 
 
 def albedo(si, bsdf, active):
@@ -90,7 +71,7 @@ class DirectCache:
 
     def query(self, x):
         """Reflected direct light at x of a surface of albedo 1, never negative."""
-        return self.field.query(self.field.encode(x), mi.Vector3f(*NOWHERE))
+        return self.field.query(self.field.encode(x), None)
 
     def start(self, scene, sensor, lights) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -106,7 +87,7 @@ class DirectCache:
         if not (math.isfinite(scale) and scale > 1e-30):
             scale = 1e-20
         shape = FieldShape(
-            n_levels=8, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.5, direction_degree=0,
+            n_levels=8, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.5, direction_degree=-1,
             width=32, n_hidden=2, leak=0.01,
         )  # fmt: skip
         self.field = Field(low, high, shape, scale=scale, seed=self.seed)
@@ -121,7 +102,7 @@ class DirectCache:
             n_valid = dr.maximum(dr.count(valid), 1)
             field.mean = dr.lerp(dr.sum(loss.luminance(y)) / n_valid, field.mean, decay)
             dr.eval(field.mean)
-        p = field.predict(x, mi.Vector3f(*NOWHERE))
+        p = field.predict(x, None)
         p = dr.select(p > 0, p, LEAK * p)
         epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
         total = dr.sum(dr.select(valid, loss.relative_l2(p, y, epsilon), 0)) / n_valid

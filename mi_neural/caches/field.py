@@ -72,6 +72,35 @@ def own_copy(value):
     return copy
 
 
+def attach_adam(parameters: dict) -> Adam:
+    """An optimiser of copies of `parameters`, by name, that a frozen step can take; β_2 = 0.99: METHODS 1."""
+    optimizer = Adam(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
+    optimizer.update(parameters)
+    # A frozen step is recorded anew when inputs that shared a variable cease to: from the start, share none
+    for key, (value, promoted, lr, (t, *moments)) in optimizer.state.items():
+        value = own_copy(value)
+        dr.enable_grad(value)
+        optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
+    return optimizer
+
+
+def descend(optimizer: Adam, loss, averaged: dict, learning_rate, decay) -> dict:
+    """One step of Adam down the gradient of `loss`, a differentiable scalar array; returns the new averaged parameters.
+
+    ``averaged <- decay averaged + (1 - decay) current``. A loss that is not finite changes nothing. May be frozen.
+    """
+    dr.backward(loss)
+    ok = dr.isfinite(dr.detach(loss))
+    # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
+    optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in optimizer})
+    optimizer.step(eval=False, active=ok)
+    optimizer.set_learning_rate({k: None for k in optimizer})
+    decay = dr.select(ok, decay, 1)
+    averaged = {k: dr.lerp(dr.detach(optimizer[k]), v, decay) for k, v in averaged.items()}
+    dr.eval(optimizer, averaged)
+    return averaged
+
+
 class Weights:
     """One set of weights: a hash grid, an MLP as tensors, and the same MLP packed for queries.
 
@@ -178,14 +207,7 @@ class Field:
         dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean)
 
     def _attach_optimizer(self) -> None:
-        # β_2 = 0.99: METHODS 1. The rate is given per step, see `step`.
-        self.optimizer = Adam(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
-        self.optimizer.update(self.current.parameters())
-        # A frozen step is recorded anew when inputs that shared a variable cease to: from the start, share none
-        for key, (value, promoted, lr, (t, *moments)) in self.optimizer.state.items():
-            value = own_copy(value)
-            dr.enable_grad(value)
-            self.optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
+        self.optimizer = attach_adam(self.current.parameters())
         self.averaged.assign({k: own_copy(v) for k, v in self.averaged.parameters().items()})
         self.averaged.pack()
         dr.eval(self.optimizer, self.averaged)
@@ -234,17 +256,7 @@ class Field:
         ``averaged <- decay averaged + (1 - decay) current``: with a `decay` that grows from 0, as the integrators give
         it, the average is free of bias from its start. A loss that is not finite changes nothing. May be frozen.
         """
-        dr.backward(loss)
-        ok = dr.isfinite(dr.detach(loss))
-        # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
-        self.optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in self.optimizer})
-        self.optimizer.step(eval=False, active=ok)
-        self.optimizer.set_learning_rate({k: None for k in self.optimizer})
-        decay = dr.select(ok, decay, 1)
-        average = {
-            k: dr.lerp(dr.detach(self.optimizer[k]), v, decay) for k, v in self.averaged.parameters().items()
-        }
-        dr.eval(self.optimizer, average)
+        average = descend(self.optimizer, loss, self.averaged.parameters(), learning_rate, decay)
         self.averaged.assign(average)
         self.averaged.pack()
 

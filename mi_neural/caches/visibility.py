@@ -13,47 +13,22 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drjit.opt import Adam
 
 from ..transport.freezing import can_freeze, undisturbed
 from ..transport.samples import PathSampler
 from . import encoding
-from .field import FieldShape, Weights, own_copy
+from .field import FieldShape, Weights, attach_adam, descend, own_copy
+from .schedule import Ramp
 
 
 @dataclass(frozen=True)
-class VisibilityTraining:
-    """Constants of training.
-
-    n_points                 points per step, see `training_points`
-    ema_decay                longest horizon of the averaged weights that queries use: 1 / (1 - ema_decay) steps
-    first_rate, last_rate    learning rates of Adam; the rate falls linearly
-    ramp                     over so many steps
-    """
+class VisibilityTraining(Ramp):
+    """Constants of training, see :class:`~mi_neural.caches.schedule.Ramp`; points: see `training_points`."""
 
     n_points: int = 2048
     ema_decay: float = 0.9
     first_rate: float = 0.05
     last_rate: float = 0.001
-    ramp: int = 200
-
-    def __post_init__(self):
-        if self.n_points < 4:
-            raise ValueError(f"n_points is {self.n_points}; it must be at least 4")
-        if not 0 <= self.ema_decay <= 1:
-            raise ValueError(f"ema_decay is {self.ema_decay}; it must lie in [0, 1]")
-        if not (self.first_rate > 0 and self.last_rate > 0):
-            raise ValueError(
-                f"the learning rates are {self.first_rate} and {self.last_rate}; they must be greater than 0"
-            )
-
-    def rate(self, step: int) -> float:
-        """Learning rate of a step."""
-        return self.first_rate + (self.last_rate - self.first_rate) * min(step / max(self.ramp, 1), 1.0)
-
-    def decay(self, step: int) -> float:
-        """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
-        return min(self.ema_decay, 1 - 1 / (step / 3 + 1))
 
 
 class VisibilityField:
@@ -75,12 +50,7 @@ class VisibilityField:
     def reset(self) -> None:
         """The weights as they were when the field was made."""
         self.weights = Weights(self.shape, self.seed)
-        self.optimizer = Adam(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
-        self.optimizer.update(self.weights.parameters())
-        for key, (value, promoted, lr, (t, *moments)) in self.optimizer.state.items():
-            value = own_copy(value)
-            dr.enable_grad(value)
-            self.optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
+        self.optimizer = attach_adam(self.weights.parameters())
         self.weights.assign({k: own_copy(v) for k, v in self.weights.parameters().items()})
         self.weights.pack()
         dr.make_opaque(self.box_min, self.box_inv_extent)
@@ -88,8 +58,10 @@ class VisibilityField:
 
     def query(self, x) -> list:
         """Predicted visibility of every light from x."""
-        features = list(self.weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
-        return [_sigmoid(v) for v in self.weights(features)]
+        return [_sigmoid(v) for v in self.weights(self._encode(x))]
+
+    def _encode(self, x) -> list:
+        return list(self.weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
 
     def step(self, x, visible, learning_rate, decay):
         """One step of Adam on ``mean (V(x) - visible)²``; `visible` is a tensor (n_outputs, points). Returns the loss.
@@ -99,19 +71,11 @@ class VisibilityField:
         averaged = self.weights.parameters()
         self.weights.assign(self.optimizer)
         n = dr.width(x)
-        inputs = self.weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent))
-        inputs = mi.TensorXf(dr.concat([i + dr.zeros(mi.Float, n) for i in inputs]), shape=(self.shape.n_inputs, n))
+        inputs = dr.concat([i + dr.zeros(mi.Float, n) for i in self._encode(x)])
+        inputs = mi.TensorXf(inputs, shape=(self.shape.n_inputs, n))
         out = self.weights.mlp(inputs)
         loss = dr.mean(dr.square(_sigmoid(out) - visible).array)
-        dr.backward(loss)
-        ok = dr.isfinite(dr.detach(loss))
-        # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
-        self.optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in self.optimizer})
-        self.optimizer.step(eval=False, active=ok)
-        self.optimizer.set_learning_rate({k: None for k in self.optimizer})
-        decay = dr.select(ok, decay, 1)
-        averaged = {k: dr.lerp(dr.detach(self.optimizer[k]), v, decay) for k, v in averaged.items()}
-        dr.eval(self.optimizer, averaged)
+        averaged = descend(self.optimizer, loss, averaged, learning_rate, decay)
         self.weights.assign(averaged)
         self.weights.pack()
         dr.eval(self.weights)

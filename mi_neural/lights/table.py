@@ -6,6 +6,8 @@ disk, point, spot, directional, environment, ...). Entries are made with vectori
 
 from __future__ import annotations
 
+import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -126,13 +128,17 @@ class LightTable:
             weight, pdf = dr.select(flat, weight, w_other), dr.select(flat, pdf, ds_other.pdf)
         return ds, dr.select(active & (pdf > 0), weight, 0), dr.select(active, pdf, 0)
 
-    def _sample_flat(self, scene, si, index, sample, active):
+    def _point(self, index, sample, active):
+        """A uniform point of flat lights, and its coordinates: (p, u, v)."""
         u, v = sample.x, sample.y
         fold = dr.gather(mi.Bool, self.folded, index, active) & (u + v > 1)
         u, v = dr.select(fold, 1 - u, u), dr.select(fold, 1 - v, v)
         corner, edge1, edge2 = (dr.gather(mi.Vector3f, a, index, active) for a in (self.corner, self.edge1, self.edge2))
+        return mi.Point3f(corner + u * edge1 + v * edge2), u, v
+
+    def _sample_flat(self, scene, si, index, sample, active):
+        p, u, v = self._point(index, sample, active)
         normal = dr.gather(mi.Vector3f, self.normal, index, active)
-        p = mi.Point3f(corner + u * edge1 + v * edge2)
         to_light = p - si.p
         d2 = dr.squared_norm(to_light)
         d = to_light * dr.rsqrt(dr.maximum(d2, 1e-30))
@@ -173,13 +179,7 @@ class LightTable:
         target = mi.Point3f(p)
         flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
         if self.any_flat:
-            u, v = sample.x, sample.y
-            fold = dr.gather(mi.Bool, self.folded, index, active) & (u + v > 1)
-            u, v = dr.select(fold, 1 - u, u), dr.select(fold, 1 - v, v)
-            corner, edge1, edge2 = (
-                dr.gather(mi.Vector3f, a, index, active & flat) for a in (self.corner, self.edge1, self.edge2)
-            )
-            target = mi.Point3f(corner + u * edge1 + v * edge2)
+            target = self._point(index, sample, active & flat)[0]
         if not self.all_flat:
             other = active & ~flat
             emitter = dr.gather(
@@ -208,14 +208,10 @@ def importance(light, x, n, two_sided):
         cos = dr.dot(light.center, n)
         return light.intensity * dr.select(two_sided, dr.abs(cos), dr.maximum(cos, 0))
     if not isinstance(light.kind, int):
-
-        class As:
-            pass
-
         cases = []
         for kind in (LOCAL, DIRECTION, ENVIRONMENT):
-            one = As()
-            one.__dict__.update(light.__dict__, kind=kind)
+            one = copy.copy(light)
+            one.kind = kind
             cases.append(importance(one, x, n, two_sided))
         return dr.select(light.kind == LOCAL, cases[0], dr.select(light.kind == DIRECTION, cases[1], cases[2]))
     to = light.center - x
@@ -300,11 +296,8 @@ def _meshes(emitters, shapes, counts, is_mesh, rng) -> dict[str, np.ndarray]:
         columns[name][flat] = values
 
     put("corner", p0), put("edge1", p1 - p0), put("edge2", p2 - p0), put("normal", normal)
-    (
-        put("area", 0.5 * length),
-        put("radiance", radiance),
-        put("plain", constant & ~bent & ~(varies & np.ones(len(counts), bool))[emitter[flat]]),
-    )
+    put("area", 0.5 * length), put("radiance", radiance)
+    put("plain", constant & ~bent & ~(varies & np.ones(len(counts), bool))[emitter[flat]])
     center = (p0 + p1 + p2) / 3
     put("center", center)
     put("radius", np.sqrt(np.max([((p - center) ** 2).sum(axis=1) for p in (p0, p1, p2)], axis=0)))

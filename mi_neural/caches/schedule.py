@@ -1,0 +1,41 @@
+"""How training goes on from step to step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A learning rate that falls linearly, and averaged weights whose horizon grows. Subclasses give the numbers.
+
+    n_points                points per step
+    ema_decay               longest horizon of the averaged weights that queries use: 1 / (1 - ema_decay) steps
+    first_rate, last_rate   learning rates of Adam
+    ramp                    steps from one to the other
+    """
+
+    n_points: int
+    ema_decay: float
+    first_rate: float
+    last_rate: float
+    ramp: int = 200
+
+    def __post_init__(self):
+        if self.n_points < 4:
+            raise ValueError(f"n_points is {self.n_points}; it must be at least 4")
+        if not 0 <= self.ema_decay <= 1:
+            raise ValueError(f"ema_decay is {self.ema_decay}; it must lie in [0, 1]")
+        if not (self.first_rate > 0 and self.last_rate > 0):
+            raise ValueError(
+                f"the learning rates are first_rate={self.first_rate} and last_rate={self.last_rate}; they must be "
+                "greater than 0"
+            )
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        return self.first_rate + (self.last_rate - self.first_rate) * min(step / max(self.ramp, 1), 1.0)
+
+    def decay(self, step: int) -> float:
+        """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
+        return min(self.ema_decay, 1 - 1 / (step / 3 + 1))

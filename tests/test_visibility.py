@@ -1,0 +1,200 @@
+"""The visibility cache: what it learns, and how."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from expectation import renders
+from light_scenes import glow
+from test_light_samplers import SAMPLERS, path_with
+
+from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining
+from mi_neural.lights.clusters import make_groups
+from mi_neural.lights.table import LightTable
+
+
+def wall_scene():
+    """A floor, a wall at x = 0, a light on either side of it, and one above."""
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    wall = mi.ScalarTransform4f().translate([0, 1.5, 0]).scale([0.05, 1.5, 2])
+    return mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 60, "to_world": mi.ScalarTransform4f().look_at([0, 7, 0], [0, 0, 0],
+            [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+        "floor": {"type": "rectangle", "to_world": up.scale(2)},
+        "wall": {"type": "cube", "to_world": wall},
+        "left": {"type": "point", "position": [-1.5, 1, 0], "intensity": 1.0},
+        "right": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1.5, 1, 0]).scale(0.1),
+            "emitter": glow()},
+        "ball": {"type": "sphere", "center": [1.2, 1, 1], "radius": 0.3, "emitter": glow()},
+        "tube": {"type": "cylinder", "p0": [1, 0.5, -1], "p1": [1, 1.5, -1], "radius": 0.2, "emitter": glow()},
+    })  # fmt: skip
+
+
+def order(scene, table) -> list[str]:
+    names = [e.get_shape().id() if e.get_shape() else e.id() for e in scene.emitters()]
+    return [names[k] for k in table.columns["emitter"]]
+
+
+def known_visibility(scene, table, p: np.ndarray) -> np.ndarray:
+    """Share of each light's samples that are seen from the points (n, 3): (lights, n)."""
+    n, m = len(p), 64
+    si = dr.zeros(mi.SurfaceInteraction3f, n * m)
+    si.p = mi.Point3f(*np.repeat(p, m, axis=0).T)
+    u = mi.Point2f(*np.random.default_rng(0).random((2, n * m), np.float32))
+    out = []
+    for k in range(table.n_lights):
+        emitter = scene.emitters()[int(table.columns["emitter"][k])]
+        ds, _ = emitter.sample_direction(si, u)
+        distance = dr.norm(mi.Point3f(ds.p) - si.p)
+        ray = mi.Ray3f(si.p, ds.d)
+        ray.maxt = distance * (1 - 1e-3)
+        seen = ~scene.ray_test(ray)
+        out.append((np.array(seen) * np.ones(n * m)).reshape(n, m).mean(axis=1))
+    return np.array(out)
+
+
+@pytest.fixture(scope="module")
+def wall():
+    scene = wall_scene()
+    table = LightTable(scene)
+    cache = VisibilityCache(VisibilityTraining(n_points=4096))
+    losses = []
+    for _ in range(100):
+        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32))
+        losses.append(cache.statistics["visibility_loss"])
+    return scene, table, cache, losses
+
+
+def said(cache, p) -> np.ndarray:
+    return np.array([np.array(v) for v in cache.field.query(mi.Point3f(*np.asarray(p, np.float32).T))])
+
+
+def test_network_learns_which_side_of_a_wall_sees_a_light(wall):
+    scene, table, cache, _ = wall
+    rng = np.random.default_rng(1)
+    p = np.stack([rng.uniform(0.4, 1.8, 400), np.full(400, 0.01), rng.uniform(-1, 1, 400)], -1)
+    p[:200, 0] *= -1
+    found = dict(zip(order(scene, table), said(cache, p), strict=False))
+    left = p[:, 0] < 0
+    print({k: (f"{v[left].mean():.3f}", f"{v[~left].mean():.3f}") for k, v in found.items()})
+    assert found["left"][left].mean() > 0.95 and found["left"][~left].mean() < 0.05
+    assert found["right"][~left].mean() > 0.9 and found["right"][left].mean() < 0.05
+
+
+def test_network_has_a_small_error_for_lights_of_every_kind(wall):
+    """Spheres and cylinders hide their own middle, which is not to count as hidden. Of a cylinder Mitsuba samples the
+    far side as well, which the cylinder itself hides: its share lies below what can be seen."""
+    scene, table, cache, _ = wall
+    rng = np.random.default_rng(2)
+    p = np.stack(
+        [rng.uniform(0.3, 1.8, 300) * rng.choice([-1, 1], 300), np.full(300, 0.01), rng.uniform(-1.8, 1.8, 300)], -1
+    )
+    known, found = known_visibility(scene, table, p), said(cache, p)
+    error = dict(zip(order(scene, table), np.sqrt(((known > 0) - found).__pow__(2).mean(axis=1)), strict=False))
+    share = dict(zip(order(scene, table), (known > 0).mean(axis=1), strict=False))
+    print("rms errors", {k: f"{v:.3f} (of {share[k]:.2f})" for k, v in error.items()})
+    assert max(v for k, v in error.items() if k != "tube") < 0.1 and error["tube"] < 0.5
+
+
+def test_loss_falls(wall):
+    losses = np.array(wall[3])
+    print(f"first {losses[:3].mean():.3f}, last {losses[-10:].mean():.4f}")
+    assert losses[-10:].mean() < 0.2 * losses[:3].mean() and np.isfinite(losses).all()
+
+
+def test_statistics_count_the_steps(wall):
+    s = wall[2].statistics
+    assert s["visibility_steps"] == wall[2].steps == 100 and s["seconds_visibility"] > 0
+
+
+def test_equal_seeds_give_equal_weights_and_others_do_not():
+    scene = wall_scene()
+    table = LightTable(scene)
+
+    def weights(seed):
+        cache = VisibilityCache(VisibilityTraining(n_points=512), seed=seed)
+        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32), 8)
+        return {k: np.array(v, np.float64) for k, v in cache.field.weights.parameters().items()}
+
+    a, b, c = weights(1), weights(1), weights(2)
+    rms = [np.sqrt(np.mean(np.concatenate([(a[k] - x[k]).ravel() for k in a]) ** 2)) for x in (b, c)]
+    print(f"rms difference: equal seeds {rms[0]:.1e}, other seeds {rms[1]:.1e}")
+    assert rms[0] < 0.1 * rms[1]
+
+
+def test_number_of_recordings_is_constant_over_thirty_images():
+    scene = wall_scene()
+    integrator = mi.load_dict({
+        "type": "nirc", "train_samples": 256, "train_frames": 2, "light_samples": 1,
+        "light_sampler": {"type": "nvc_lights", "train_frames": 4, "train_samples": 256},
+    })  # fmt: skip
+    visibility = integrator.light_sampler.cache
+
+    def recordings():
+        return [integrator.cache._frame.n_recordings, visibility._frame.n_recordings,
+                *(p.n_recordings for p in integrator.state.passes.values())]  # fmt: skip
+
+    for k in range(5):
+        integrator.render(scene, spp=1, seed=k)
+    before, steps = recordings(), visibility.steps
+    for k in range(30):
+        integrator.render(scene, spp=1, seed=10 + k)
+    print(f"recordings {before}")
+    assert recordings() == before and max(before) <= 4 and visibility.steps == steps + 30
+
+
+def test_training_follows_its_keys():
+    scene = wall_scene()
+    for keys, known in (({"train_frames": 3, "train_steps": 2}, [3, 5, 7]), ({"train_frames": 3, "train_steps": 0},
+        [3, 3, 3]),
+                        ({"train_frames": 3, "freeze": True}, [0, 0, 0]), ({"train_frames": 0, "train_steps": 1}, [0,
+                            1, 2]),
+                        ({"visibility": False}, [0, 0, 0])):  # fmt: skip
+        integrator = path_with({"type": "nvc_lights", "train_samples": 64, **keys})
+        found = []
+        for k in range(3):
+            integrator.render(scene, spp=1, seed=k)
+            found.append(integrator.light_sampler.cache.steps)
+        assert found == known, keys
+
+
+def test_reset_forgets_what_was_learned():
+    scene = wall_scene()
+    integrator = path_with({"type": "nvc_lights", "train_samples": 64, "train_frames": 5})
+    integrator.render(scene, spp=1)
+    facts = integrator.light_sampler.statistics()
+    assert facts["lights"] == facts["light_groups"] == 4 and facts["visibility_steps"] == 5
+    integrator.light_sampler.reset()
+    assert integrator.light_sampler.cache.steps == 0
+    integrator.render(scene, spp=1)
+    assert integrator.light_sampler.cache.steps == 5
+
+
+def test_learned_visibility_lessens_the_noise_where_a_wall_stands_between_lights():
+    scene = wall_scene()
+    noise = {}
+    for name in ("uniform", "unshadowed", "trained"):
+        images = renders(scene, path_with(name), 16, 16)
+        noise[name] = np.sqrt(images.var(axis=0)).mean()
+    print({k: f"{v:.2e}" for k, v in noise.items()})
+    assert noise["trained"] < 0.9 * noise["unshadowed"] and noise["trained"] < 0.9 * noise["uniform"]
+
+
+def test_rate_and_decay_follow_their_schedule():
+    t = VisibilityTraining()
+    rates, decays = (np.array([f(k) for k in range(400)]) for f in (t.rate, t.decay))
+    assert rates[0] == 0.05 and rates[200] == rates[-1] == pytest.approx(0.001) and (np.diff(rates) <= 0).all()
+    assert decays[0] == 0 and decays[-1] == 0.9 and (np.diff(decays) >= 0).all()
+
+
+def test_orthographic_camera_that_cannot_be_frozen_works():
+    scene = mi.load_dict({
+        "type": "scene", "a": {"type": "point", "position": [0, 0, 3]}, "b": {"type": "point", "position": [1, 0, 3]},
+        "floor": {"type": "rectangle"},
+        "sensor": {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+    })  # fmt: skip
+    image = np.array(path_with({**SAMPLERS["trained"], "train_frames": 3}).render(scene, spp=4))
+    assert np.isfinite(image).all() and image.mean() > 0
