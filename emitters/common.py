@@ -17,6 +17,9 @@ class LightSampler(mi.Emitter):
     own choice.
     """
 
+    #: Whether the texels of an environment are lights of their own.
+    texels = False
+
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
@@ -55,13 +58,13 @@ class LightSampler(mi.Emitter):
         if self.scene.changed(scene):
             self.reset()
             self.held, self.sampler = None, None
-            self.watched = _watch(scene)
+            self.watched = _watch(scene, self.texels)
         if not self.watched:
             return None
         with dr.suspend_grad():
             if self.held is None or any(_changed(*w, h) for w, h in zip(self.watched, self.held, strict=True)):
                 self.held = [_hold(params[name]) for params, name in self.watched]
-                table = LightTable(scene)
+                table = LightTable(scene, texels=self.texels)
                 self.sampler = self.make(scene, table) if table.n_lights > 1 else None
             if self.sampler is not None and train:
                 with dr.resume_grad():
@@ -99,10 +102,10 @@ class LightSampler(mi.Emitter):
         return dr.zeros(mi.Wavelength), mi.Spectrum(0)
 
 
-def _watch(scene) -> list:
+def _watch(scene, texels: bool) -> list:
     """Parameters that the table is made of, as (parameters, name); empty if there is at most one light."""
     emitters = scene.emitters()
-    if len(emitters) < 2 and not any(
+    if len(emitters) < 2 and not (texels and scene.environment() is not None) and not any(
         e.get_shape() is not None and e.get_shape().primitive_count() > 1 for e in emitters
     ):
         return []

@@ -35,6 +35,11 @@ class NVCLightSampler(LightSampler):
        - |string|
        - What an output stands for where there are more lights: ``kmeans`` (near each other), ``emitter`` (all
          triangles of an emitter), ``auto`` (by emitter if there are few, small ones). (Default: auto)
+     * - environment_cells
+       - |int|
+       - Parts of the environment that the network has an output for each, beside ``outputs``; 0: the environment is one
+         light, and Mitsuba chooses a direction in it. 32 of them have a quarter less noise in a room lit through
+         windows, and cost as much in time (README). (Default: 0)
      * - candidates
        - |int|
        - Lights of a cluster that one is resampled from. (Default: 16)
@@ -58,8 +63,9 @@ class NVCLightSampler(LightSampler):
        - Of the initial weights, the training points and the clusters. (Default: 0)
 
     *Works with* all emitters of Mitsuba; point, spot and directional lights, meshes of thousands of emissive triangles
-    and the environment (as one light) can be mixed. With a single light it costs nothing. *Leaves out* the choice of a
-    direction within the environment: that stays Mitsuba's.
+    and the environment can be mixed. With a single light it costs nothing. *Leaves out* glossy lobes: surfaces weigh
+    lights by irradiance (with the lobes by linearly transformed cosines a choice takes 2 to 2.6 times as long; variance
+    0.98 of this on a staircase, 0.67 between glossy lamps).
 
     .. tabs::
         .. code-tab:: xml
@@ -75,6 +81,7 @@ class NVCLightSampler(LightSampler):
         self.cache, self.begun = None, False
         self.outputs = props.get("outputs", 32)
         self.clusters = props.get("clusters", "auto")
+        self.environment_cells = props.get("environment_cells", 0)
         self.candidates = props.get("candidates", 16)
         self.visibility = props.get("visibility", True)
         self.train_frames = props.get("train_frames", 32)
@@ -86,6 +93,9 @@ class NVCLightSampler(LightSampler):
         self._check(2 <= self.outputs <= 256, f"outputs is {self.outputs}; it must lie in 2..256")
         self._check(self.clusters in clusters.METHODS,
                     f"clusters is '{self.clusters}'; give one of: {', '.join(clusters.METHODS)}")  # fmt: skip
+        self._check(0 <= self.environment_cells <= 256,
+                    f"environment_cells is {self.environment_cells}; it must lie in 0..256")  # fmt: skip
+        self.texels = self.environment_cells > 0
         self._check(self.candidates >= 1, f"candidates is {self.candidates}; it must be at least 1")
         self._check(self.train_frames >= 0, f"train_frames is {self.train_frames}; it must be 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
@@ -102,7 +112,7 @@ class NVCLightSampler(LightSampler):
 
     def make(self, scene, table):
         try:
-            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed)
+            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed, self.environment_cells)
         except ValueError as e:
             raise ValueError(f"{self.plugin}: {e}") from None
         field = self.cache.field if self.visibility else None

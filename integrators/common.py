@@ -12,6 +12,7 @@ import numpy as np
 
 from mi_neural.caches.field import CacheFileError, Field, FieldShape
 from mi_neural.caches.incident import IncidentCache, Training
+from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, light_sampler_of
 from mi_neural.transport.freezing import undisturbed
 from mi_neural.transport.samples import PathSampler
@@ -89,26 +90,6 @@ def scene_signature(scene) -> str:
         [float(f"{float(v):.4g}") for v in (*box.min, *box.max)],
     )
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
-
-
-def check_scene(scene, plugin: str) -> None:
-    """Refuse, before any work, a scene that cannot be rendered; the message says what to do."""
-    if not scene.sensors():
-        raise ValueError(f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>")
-    if not scene.emitters():
-        raise ValueError(f"{plugin}: the scene has no emitter, the image would be black; add a light")
-    for sensor in scene.sensors():
-        if sensor.get_medium() is not None:
-            raise ValueError(
-                f"{plugin}: the camera is inside a participating medium, which the cache does not model; "
-                'use <integrator type="volpath"/>'
-            )
-    for shape in scene.shapes():
-        if shape.is_medium_transition():
-            raise ValueError(
-                f"{plugin}: shape '{shape.id()}' borders a participating medium, which the cache does not model; "
-                'use <integrator type="volpath"/>'
-            )
 
 
 def _other_scene(path) -> str:
@@ -411,13 +392,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     # Rendering
 
     def _sensor(self, scene, sensor):
-        if isinstance(sensor, int):
-            if not scene.sensors():
-                check_scene(scene, self.plugin)
-            if not 0 <= sensor < len(scene.sensors()):
-                raise ValueError(f"{self.plugin}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
-            sensor = scene.sensors()[sensor]
-        return sensor
+        return sensor_of(scene, sensor, self.plugin)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural.integrators.checks import sensor_of
+
 LIGHT_SAMPLER_KEY = """
      * - light_sampler
        - |emitter|
@@ -32,11 +34,12 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
+        self.plugin = props.plugin_name()
         self.light_sampler = light_sampler_of(props)
         self.lights, self.entered = None, False
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        sensor = sensor_of(scene, sensor, self.plugin)
         if self.entered:  # Mitsuba's own render() comes back here once
             return super().render(scene, sensor, seed, spp, develop, evaluate)
         self.entered = True
@@ -64,7 +67,7 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
 
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train the light sampler for so many frames. `progress` is called with (done, total). Returns `statistics`."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        sensor = sensor_of(scene, sensor, self.plugin)
         for k in range(frames if self.light_sampler is not None else 0):
             self.prepare_lights(scene, sensor)
             if progress is not None:
@@ -73,7 +76,7 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
 
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. Who has learned nothing yet has not afterwards."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        sensor = sensor_of(scene, sensor, self.plugin)
         fresh = not self.statistics().get("visibility_steps")
         for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
             dr.eval(self.render(scene, sensor, 0, spp))

@@ -7,7 +7,8 @@ import mitsuba as mi
 
 from mi_neural.caches.direct import DirectCache, DirectTraining, albedo
 from mi_neural.caches.visibility import VisibilityCache
-from mi_neural.integrators.common import check_scene, light_sampler_of
+from mi_neural.integrators.checks import check_scene, sensor_of
+from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights import clusters
 from mi_neural.lights.sampling import VisibleLights
 from mi_neural.lights.table import LightTable
@@ -224,10 +225,7 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
     # Rendering
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        if isinstance(sensor, int):
-            if not scene.sensors():
-                check_scene(scene, self.plugin)
-            sensor = scene.sensors()[sensor]
+        sensor = sensor_of(scene, sensor, self.plugin)
         if self.entered:  # Mitsuba's own render() comes back here once
             return super().render(scene, sensor, seed, spp, develop, evaluate)
         self.entered = True

@@ -7,7 +7,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.integrators.common import check_scene, light_sampler_of
+from mi_neural.integrators.checks import check_scene, sensor_of
+from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.transport import reservoir, vertex
@@ -196,13 +197,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The mean of the next `spp` frames (0: as many as the sampler's sample count says)."""
-        if isinstance(sensor, int):
-            n_sensors = len(scene.sensors())
-            if n_sensors:
-                self._check(0 <= sensor < n_sensors, f"there is no sensor {sensor}; the scene has {n_sensors}")
-            else:
-                check_scene(scene, "restir_di")
-            sensor = scene.sensors()[sensor]
+        sensor = sensor_of(scene, sensor, "restir_di")
         self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
         spp = spp or sensor.sampler().sample_count()
         seed = int(seed[0]) if hasattr(seed, "__len__") else int(seed)

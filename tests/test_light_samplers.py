@@ -22,6 +22,9 @@ SAMPLERS = {
     "unshadowed": {"type": "nvc_lights", "visibility": False},
     "clusters": {"type": "nvc_lights", "outputs": 8, "clusters": "kmeans", "train_frames": 20, "train_steps": 0,
                  "train_samples": 512},
+    "cells": {"type": "nvc_lights", "environment_cells": 16, "train_frames": 30, "train_steps": 0,
+              "train_samples": 1024},
+    "untrained cells": {"type": "nvc_lights", "environment_cells": 8, "train_frames": 0, "train_steps": 0},
 }  # fmt: skip
 
 
@@ -88,10 +91,12 @@ def place(tmp_path_factory):
 
 @pytest.mark.parametrize("kind, name", [
     *[("two", name) for name in ("power", "trained")],
-    *[("kinds", name) for name in ("uniform", "trained", "untrained", "clusters")],
+    *[("kinds", name) for name in ("uniform", "trained", "untrained", "clusters", "cells")],
     *[("32", name) for name in ("trained", "clusters")],
     *[("mesh", name) for name in ("power", "clusters")],
     *[("spotted", name) for name in ("uniform", "trained")],
+    *[("envmap", name) for name in ("cells", "untrained cells")],
+    ("constant", "cells"),
 ])  # fmt: skip
 def test_image_is_that_of_path(place, kind, name):
     scene, path = place(kind)
@@ -105,10 +110,11 @@ def test_image_of_longer_paths_is_that_of_path(place, name):
     assert_same_mean(renders(scene, path_with(name, 4), 16, 128), path, name, relative=1e-5)
 
 
-@pytest.mark.parametrize("kind, nonsense", [("kinds", "random"), ("two", "NaN"), ("32", "inverted")])
+@pytest.mark.parametrize("kind, nonsense", [("kinds", "random"), ("two", "NaN"), ("32", "inverted"),
+                                            ("envmap", "inverted")])
 def test_network_that_says_nonsense_gives_the_same_image(place, kind, nonsense):
     scene, path = place(kind)
-    integrator = path_with("trained")
+    integrator = path_with("cells" if kind == "envmap" else "trained")
     sampler = integrator.light_sampler
     lights = sampler.lights(scene, scene.sensors()[0])
     weights = lights.field.weights
@@ -171,6 +177,8 @@ def test_single_light_costs_and_changes_nothing(kind):
     scene = test_scene(lights(kind), 8)
     plain = np.array(mi.load_dict({"type": "plain_path", "max_depth": 3}).render(scene, spp=16, seed=5))
     for name in SAMPLERS:
+        if "cells" in name:
+            continue  # to them an environment is many lights
         integrator = path_with(name, 3)
         assert integrator.light_sampler.lights(scene, scene.sensors()[0]) is None
         np.testing.assert_array_equal(np.array(integrator.render(scene, spp=16, seed=5)), plain)

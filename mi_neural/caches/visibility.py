@@ -153,7 +153,7 @@ class VisibilityCache:
             points = np.concatenate([np.array(s.p).T[v] for s, v in zip((si, si_next), valid, strict=True)])
         low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
         shape = self.shape or FieldShape(
-            n_levels=10, n_features=4, hashmap_size=2**14, base_resolution=16, per_level_scale=1.4, direction_degree=-1,
+            n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
             width=32, n_hidden=2, n_outputs=n_outputs, leak=0.01,
         )  # fmt: skip
         self.field = VisibilityField(low, high, shape, self.seed)

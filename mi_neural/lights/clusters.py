@@ -14,10 +14,10 @@ METHODS = ("auto", "kmeans", "emitter")
 class Groups:
     """A partition of a light table into at most `n_outputs` groups. A PyTree.
 
-    As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in Python lists
-    `kind`, and in arrays. `start`, `count`: its range in `member`, the lights sorted by group; `within` is the
-    probability of a light in its group (proportional to its intensity), `cumulative` its running sum over `member`;
-    `group_of` leads from light to group.
+    As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in a Python list
+    `kind`, and in arrays. `cell`: which groups are parts of the environment. `start`, `count`: its range in `member`,
+    the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity),
+    `cumulative` its running sum over `member`; `group_of` leads from light to group.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -58,6 +58,8 @@ class Groups:
         centers = c["center"].astype(np.float64)
         center = mean(centers)
         self.kind = [int(k) for k in c["kind"][order][start]]
+        first_texel = table.sky.first if table.sky is not None else table.n_lights
+        self.cell = [bool(i >= first_texel) for i in order[start]]
         radius = np.zeros(self.n_groups)
         np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
         radius[[k != LOCAL for k in self.kind]] = 0
@@ -71,7 +73,15 @@ class Groups:
         radius[one] = c["radius"][order][start][one]
         self.host = {"label": label, "count": count, "intensity": total, "center": center, "radius": radius}
         cone = np.where(widest >= np.pi - 1e-3, -1.0, np.cos(widest + np.where(one, 0, 1e-4)))
-        cone[[k != LOCAL for k in self.kind]] = -1
+        # Lights at infinity: the angle about their mean direction
+        far = np.array([k == DIRECTION for k in self.kind])
+        length = np.linalg.norm(center, axis=1)
+        center[far] = np.where(length > 1e-6, center.T / np.maximum(length, 1e-30), [[0], [0], [1]]).T[far]
+        angle = np.arccos(np.clip((centers * center[label]).sum(axis=1), -1, 1)) + np.arccos(np.clip(c["cone"], -1, 1))
+        widest = np.zeros(self.n_groups)
+        np.maximum.at(widest, label, angle)
+        cone = np.where(far, np.cos(np.minimum(widest + np.where(one, 0, 1e-4), np.pi)), cone)
+        cone[[k == ENVIRONMENT for k in self.kind]] = -1
         vec = lambda v: mi.Vector3f(np.ascontiguousarray(v.T, np.float32))  # noqa: E731
         big = np.finfo(np.float32).max
         flt = lambda v: mi.Float(np.ascontiguousarray(np.minimum(v, big), np.float32))  # noqa: E731
@@ -115,21 +125,41 @@ def morton(points: np.ndarray) -> np.ndarray:
     return code
 
 
-def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0) -> Groups:
+def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0, n_cells: int = 32) -> Groups:
     """Groups of a table: each light alone if they are no more than `n_outputs`, else clusters.
 
     `method`: ``emitter`` (all triangles of an emitter together), ``kmeans``, or ``auto``: by emitter where they are
-    few enough and small, else k-means. Lights at infinity and the environment are always alone.
+    few enough and small, else k-means. Lights at infinity are always alone. The texels of an
+    environment, if the table has them, make up to `n_cells` groups more.
     """
-    c = table.columns
-    n = table.n_lights
+    lights = {k: v[: table.sky.first] for k, v in table.columns.items()} if table.sky is not None else table.columns
+    label = _label_lights(lights, n_outputs, method, seed)
+    if table.sky is not None:
+        label = np.concatenate([label, label.max(initial=-1) + 1 + _label_texels(table.sky, n_cells, seed)])
+    return Groups(table, label)
+
+
+def _label_texels(sky, n_cells: int, seed: int) -> np.ndarray:
+    """Groups of the sky's texels near each other and of like power, made of square blocks of them."""
+    side = min(sky.size, 64)
+    texel = np.arange(sky.size**2)
+    block = texel // sky.size * side // sky.size * side + texel % sky.size * side // sky.size
+    power = np.bincount(block, sky.irradiance)
+    middle = np.stack([np.bincount(block, v) for v in sky.direction.T], axis=-1)
+    middle /= np.maximum(np.linalg.norm(middle, axis=1), 1e-30)[:, None]
+    # A block of mean power counts at least so much that dark parts of the sky are not all one group
+    return kmeans(middle, n_cells, power + 0.1 * power.mean(), seed)[block]
+
+
+def _label_lights(c: dict[str, np.ndarray], n_outputs: int, method: str, seed: int) -> np.ndarray:
+    n = len(c["emitter"])
     if n <= n_outputs:
-        return Groups(table, np.arange(n))
+        return np.arange(n)
     by_emitter = np.unique(c["emitter"], return_inverse=True)[1].ravel()
     if method == "emitter" or (method == "auto" and by_emitter.max() + 1 <= n_outputs
                                and np.bincount(by_emitter).max() <= 64):  # fmt: skip
         if by_emitter.max() + 1 <= n_outputs:
-            return Groups(table, by_emitter)
+            return by_emitter
         raise ValueError(
             f"there are {by_emitter.max() + 1} emitters, more than the {n_outputs} outputs; "
             'use clusters="kmeans" or raise outputs'
@@ -146,7 +176,7 @@ def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: i
     features = c["center"][~alone].astype(np.float64)
     weights = np.maximum(c["intensity"][~alone].astype(np.float64), 1e-30)
     label[~alone] = n_alone + kmeans(features, n_outputs - n_alone, weights, seed)
-    return Groups(table, label)
+    return label
 
 
 def kmeans(points: np.ndarray, k: int, weights: np.ndarray, seed: int = 0, rounds: int = 30) -> np.ndarray:
@@ -158,6 +188,8 @@ def kmeans(points: np.ndarray, k: int, weights: np.ndarray, seed: int = 0, round
     n = len(points)
     if n <= k:
         return np.arange(n)
+    if not weights.sum() > 0:
+        weights = np.ones(n)
     p = weights / weights.sum()
     centers = points[[rng.choice(n, p=p)]]
     d2 = ((points - centers[0]) ** 2).sum(axis=1)

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport import vertex
+from .sky import REACH, Sky
 
 #: More entries than this are refused: 100 bytes each, besides what building them takes.
 MAX_LIGHTS = 2**24
@@ -37,9 +38,10 @@ class LightTable:
     area      of flat ones; 0 elsewhere
     radiance  mean emitted radiance of flat ones
     plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is
-    kind      LOCAL, DIRECTION or ENVIRONMENT
+    kind      LOCAL, DIRECTION or ENVIRONMENT (as a whole; its texels are of kind DIRECTION)
     center, radius   bounding sphere of a LOCAL entry; DIRECTION: `center` is the direction towards the light
-    axis, cone       mean normal, and cosine of the largest angle of a normal to it; -1: light leaves in all directions
+    axis, cone       mean normal, and cosine of the largest angle of a normal to it; -1: light leaves in all directions.
+                     DIRECTION: `cone` is the cosine of the largest angle of its directions to `center`
     intensity        LOCAL: radiance times area, or radiant intensity; else irradiance of a surface that faces the light
 
     `n_lights` etc. are Python numbers; `first`, `stride` lead from an emitter's registry number and a primitive to an
@@ -53,7 +55,7 @@ class LightTable:
         "first": object, "stride": object,
     }  # fmt: skip
 
-    def __init__(self, scene, seed: int = 0):
+    def __init__(self, scene, seed: int = 0, texels: bool = False):
         emitters = scene.emitters_dr()
         n_emitters = dr.width(emitters)
         rng = np.random.default_rng(seed)
@@ -69,6 +71,9 @@ class LightTable:
             )
         columns = _meshes(emitters, shapes, counts, is_mesh, rng)
         _others(columns, scene, emitters, rng)
+        self.sky = None
+        if texels and (columns["kind"] == ENVIRONMENT).any():
+            columns, self.sky = _texels(columns, scene, seed)
         self.assign(columns)
 
         ids = np.array(dr.reinterpret_array(mi.UInt32, emitters)).ravel()
@@ -93,6 +98,8 @@ class LightTable:
                 values = kinds[values.dtype.kind](values)
             setattr(self, name, values)
         self.any_flat, self.all_flat = bool(columns["flat"].any()), bool(columns["flat"].all())
+        n_texels = self.sky.size**2 if self.sky is not None else 0
+        self.any_other = int((~columns["flat"]).sum()) > n_texels  # sampled by their emitters
         self.all_plain = bool((columns["plain"] | ~columns["flat"]).all())
         self.kinds = sorted(set(columns["kind"].tolist()))
 
@@ -105,7 +112,8 @@ class LightTable:
         emits = active & (number > 0)
         first = dr.gather(mi.UInt32, self.first, number, emits)
         stride = dr.gather(mi.UInt32, self.stride, number, emits)
-        return first + stride * dr.select(si.is_valid(), si.prim_index, 0), emits
+        beyond = self.sky.texel_of(-si.wi) if self.sky is not None else mi.UInt32(0)
+        return first + stride * dr.select(si.is_valid(), si.prim_index, beyond), emits
 
     def sample(self, scene, si, index, sample, active):
         """A point on (direction to) light `index`, seen from `si`.
@@ -118,15 +126,24 @@ class LightTable:
         flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
         if self.any_flat:
             ds, weight, pdf = self._sample_flat(scene, si, index, sample, active & flat)
-        if not self.all_flat:
-            other = active & ~flat
+        if self.any_other:
+            other = active & ~flat & ~self._is_texel(index)
             emitter = dr.gather(
                 mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, other), other
             )
             ds_other, w_other = emitter.sample_direction(si, sample, other)
             ds = dr.select(flat, ds, ds_other) if self.any_flat else ds_other
             weight, pdf = dr.select(flat, weight, w_other), dr.select(flat, pdf, ds_other.pdf)
+        if self.sky is not None:
+            texel = active & self._is_texel(index)
+            ds_sky, w_sky = self.sky.sample(scene, si.p, index - self.sky.first, sample, texel)
+            alone = not (self.any_flat or self.any_other)
+            ds = ds_sky if alone else dr.select(texel, ds_sky, ds)
+            weight, pdf = dr.select(texel, w_sky, weight), dr.select(texel, ds_sky.pdf, pdf)
         return ds, dr.select(active & (pdf > 0), weight, 0), dr.select(active, pdf, 0)
+
+    def _is_texel(self, index):
+        return index >= self.sky.first if self.sky is not None else mi.Bool(False)
 
     def _point(self, index, sample, active):
         """A uniform point of flat lights, and its coordinates: (p, u, v)."""
@@ -167,9 +184,11 @@ class LightTable:
             area = dr.gather(mi.Float, self.area, index, active & flat)
             cos = -dr.dot(ds.d, dr.gather(mi.Vector3f, self.normal, index, active & flat))
             pdf = dr.select((cos > 0) & (area > 0), dr.square(ds.dist) / (cos * area), 0)
-        if not self.all_flat:
-            other = active & ~flat
+        if self.any_other:
+            other = active & ~flat & ~self._is_texel(index)
             pdf = dr.select(flat, pdf, ds.emitter.pdf_direction(si_ref, ds, other))
+        if self.sky is not None:
+            pdf = dr.select(self._is_texel(index), 1 / self.sky.solid_angle, pdf)
         return dr.select(active, pdf, 0)
 
     def shadow_ray(self, scene, p, index, sample, active):
@@ -180,13 +199,16 @@ class LightTable:
         flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
         if self.any_flat:
             target = self._point(index, sample, active & flat)[0]
-        if not self.all_flat:
-            other = active & ~flat
+        if self.any_other:
+            other = active & ~flat & ~self._is_texel(index)
             emitter = dr.gather(
                 mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, other), other
             )
             ds, _ = emitter.sample_direction(it, sample, other)
             target = dr.select(flat, target, ds.p)
+        if self.sky is not None:
+            away = p + self.sky.at(index - self.sky.first, sample) * self.sky.distance
+            target = dr.select(self._is_texel(index), away, target)
         to = target - p
         distance = dr.norm(to)
         ray = mi.Ray3f(p, to / dr.maximum(distance, 1e-30))
@@ -206,7 +228,8 @@ def importance(light, x, n, two_sided):
         return mi.Float(light.intensity)
     if isinstance(light.kind, int) and light.kind == DIRECTION:
         cos = dr.dot(light.center, n)
-        return light.intensity * dr.select(two_sided, dr.abs(cos), dr.maximum(cos, 0))
+        cos = _widen(dr.select(two_sided, dr.abs(cos), cos), light.cone, _sine(light.cone))
+        return light.intensity * dr.maximum(cos, 0)
     if not isinstance(light.kind, int):
         cases = []
         for kind in (LOCAL, DIRECTION, ENVIRONMENT):
@@ -226,16 +249,34 @@ def importance(light, x, n, two_sided):
     cos_i = dr.select(two_sided, dr.abs(cos_i), cos_i)
     cos_i = dr.select(inside, 1, _widen(cos_i, cos_b, sin_b))
     cos_o = light.cone
-    sin_o = dr.sqrt(dr.maximum(1 - dr.square(cos_o), 0))
-    cos_l = _widen(-dr.dot(d, light.axis), cos_o, sin_o)
+    cos_l = _widen(-dr.dot(d, light.axis), cos_o, _sine(cos_o))
     cos_l = dr.select(inside | (cos_o <= -1), 1, _widen(cos_l, cos_b, sin_b))
     return light.intensity * dr.maximum(cos_i, 0) * dr.maximum(cos_l, 0) / dr.maximum(d2, dr.maximum(r2, 1e-30))
 
 
 def _widen(cos, cos_by, sin_by):
     """Cosine of an angle made smaller by another, at least 0."""
-    sin = dr.sqrt(dr.maximum(1 - dr.square(cos), 0))
-    return dr.select(cos >= cos_by, 1, cos * cos_by + sin * sin_by)
+    return dr.select(cos >= cos_by, 1, cos * cos_by + _sine(cos) * sin_by)
+
+
+def _sine(cos):
+    return dr.sqrt(dr.maximum(1 - dr.square(cos), 0))
+
+
+def _texels(columns, scene, seed) -> tuple[dict[str, np.ndarray], Sky]:
+    """Columns with the texels of the environment, at the end, in the place of its one entry."""
+    row = int(np.flatnonzero(columns["kind"] == ENVIRONMENT)[0])
+    sky = Sky(scene, int(columns["emitter"][row]), seed)
+    n = sky.size**2
+    rest = np.arange(len(columns["emitter"])) != row
+    sky.first = int(rest.sum())
+    new = {k: np.repeat(v[row : row + 1], n, axis=0) for k, v in columns.items()}
+    new["prim"] = np.arange(n, dtype=np.uint32)
+    new["kind"][:] = DIRECTION
+    new["center"] = sky.direction.astype(np.float32)
+    new["intensity"] = sky.irradiance.astype(np.float32)
+    new["cone"][:] = np.cos(min(REACH / sky.size, np.pi))  # the longest half diagonal of a texel is below
+    return {k: np.concatenate([v[rest], new[k]]) for k, v in columns.items()}, sky
 
 
 def _interaction(shape, prim, uv, ray, active):
@@ -415,4 +456,4 @@ def _others(columns, scene, emitters, rng) -> None:
     columns["radius"][rows] = np.where(surface, radius, 0)
     columns["intensity"][rows] = np.where(environment, irradiance / 4, np.where(distant, irradiance, intensity))
     columns["axis"][rows] = np.where(even[:, None], normals[:, 0], [0, 0, 1])
-    columns["cone"][rows] = np.where(even, 1, -1)
+    columns["cone"][rows] = np.where(even | distant, 1, -1)
