@@ -85,12 +85,14 @@ def load_scene(
     size: tuple[int, int] | None = None,
     parameters: dict[str, str] | None = None,
     integrator_keys: dict[str, object] | None = None,
+    merge: bool = True,
 ) -> LoadedScene:
     """Load a scene file or shipped scene under the active variant.
 
     size             (width, height) for the film of every sensor; a crop window is dropped
     parameters       values for the scene's `$parameters`
     integrator_keys  keys to set on the scene's own integrator
+    merge            let Mitsuba join meshes and equal materials, as it does by default; without it each keeps its name
 
     Raises :class:`InputError` for an unknown scene, a parameter the scene does not have, an unknown key, a scene that
     Mitsuba cannot load or that has an empty film.
@@ -100,6 +102,7 @@ def load_scene(
     path = find_scene(name)
     parameters = {k: str(v) for k, v in (parameters or {}).items()}
     config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = config.merge_equivalent = merge
     with _resolving(path.parent), _readable(path, parameters):
         state = mi.parser.parse_file(config, str(path), **parameters)
         _set_film_size(state, size)

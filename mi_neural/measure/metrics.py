@@ -124,14 +124,19 @@ def smape(image: np.ndarray, previous: np.ndarray, epsilon: float = SMAPE_EPSILO
     eps is `epsilon` times the mean of (|a| + |b|) / 2, so that the figure does not depend on the images' unit. Two
     black images have 0. Raises ``ValueError`` for unequal shapes; non-finite pixels count as black in either image.
     """
+    return float(smape_map(image, previous, epsilon).mean())
+
+
+def smape_map(image: np.ndarray, previous: np.ndarray, epsilon: float = SMAPE_EPSILON) -> np.ndarray:
+    """What :func:`smape` averages, as the mean of the channels: shape (height, width), values in [0, 2]."""
     a, b = _as_image(image, "image"), _as_image(previous, "previous image")
     _check_same_shape(a, b, "previous image")
     a, b = _black_where_nonfinite(a), _black_where_nonfinite(b)
 
     magnitude = np.abs(a) + np.abs(b)
     if magnitude.max() == 0.0:
-        return 0.0
-    return float((2.0 * np.abs(a - b) / (magnitude + epsilon * 0.5 * magnitude.mean())).mean())
+        return np.zeros(a.shape[:2])
+    return (2.0 * np.abs(a - b) / (magnitude + epsilon * 0.5 * magnitude.mean())).mean(axis=-1)
 
 
 def flip_exposures(reference: np.ndarray) -> FlipExposures:

@@ -102,23 +102,30 @@ def pass_spp(scene) -> int:
     return spp
 
 
-def reference_path(loaded: LoadedScene, folder: Path) -> Path:
-    """Where the reference of this scene file, these parameters and this film is kept."""
+def reference_path(loaded: LoadedScene, folder: Path, state: str = "") -> Path:
+    """Where the reference of this scene file, these parameters, this film and this state of the scene is kept."""
     facts = [loaded.digest, sorted(loaded.parameters.items()), loaded.size, sorted(loaded.carried.items())]
+    facts += [state] if state else []
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:12]
     return folder / f"reference_{loaded.name}_{key}.exr"
 
 
 def render_reference(
-    loaded: LoadedScene, spp: int, folder: Path, progress: Progress | None = None, seed: int = 0
+    loaded: LoadedScene,
+    spp: int,
+    folder: Path,
+    progress: Progress | None = None,
+    seed: int = 0,
+    state: str = "",
 ) -> Reference:
     """The reference for a scene with at least `spp` samples a pixel, by Mitsuba's `path` at the scene's depth.
 
     Kept in `folder` under a name made of scene file, parameters and size. One with enough samples is taken as it is,
-    one with fewer is continued. Meshes and textures are not part of the name: after changing them delete the file. On
-    Ctrl-C the passes so far are written and ``KeyboardInterrupt`` goes on to the caller.
+    one with fewer is continued. Meshes and textures are not part of the name: after changing them delete the file; for
+    a scene whose parameters were changed in memory, give a `state` that tells these changes from others. On Ctrl-C the
+    passes so far are written and ``KeyboardInterrupt`` goes on to the caller.
     """
-    path, size = reference_path(loaded, folder), pass_spp(loaded.scene)
+    path, size = reference_path(loaded, folder, state), pass_spp(loaded.scene)
     n_passes = max(2, -(-spp // size))
     moments = _Moments.resume(path, size, loaded.size)
     start = saved = clock()

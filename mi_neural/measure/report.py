@@ -23,16 +23,16 @@ from .reference import Reference
 COLUMNS = (
     ("integrator", lambda r: r.label + (" + denoiser" if r.denoised else "")),
     ("mode", lambda r: r.mode),
-    ("budget s", lambda r: _number(r.budget_seconds)),
-    ("spp", lambda r: _number(r.spp)),
-    ("train s", lambda r: _number(r.seconds_train)),
-    ("render s", lambda r: _number(r.seconds_render)),
-    ("denoise s", lambda r: _number(r.seconds_denoise) if r.denoised else ""),
-    ("ns/sample", lambda r: _number(r.ns_per_sample)),
-    ("relMSE trimmed", lambda r: _number(r.relmse_trimmed)),
-    ("relMSE", lambda r: _number(r.relmse)),
-    ("FLIP", lambda r: _number(r.flip)),
-    ("flicker", lambda r: _number(r.flicker)),
+    ("budget s", lambda r: number(r.budget_seconds)),
+    ("spp", lambda r: number(r.spp)),
+    ("train s", lambda r: number(r.seconds_train)),
+    ("render s", lambda r: number(r.seconds_render)),
+    ("denoise s", lambda r: number(r.seconds_denoise) if r.denoised else ""),
+    ("ns/sample", lambda r: number(r.ns_per_sample)),
+    ("relMSE trimmed", lambda r: number(r.relmse_trimmed)),
+    ("relMSE", lambda r: number(r.relmse)),
+    ("FLIP", lambda r: number(r.flip)),
+    ("flicker", lambda r: number(r.flicker)),
 )
 
 MODE_TEXT = {
@@ -64,9 +64,9 @@ def table(rows: Iterable[Row]) -> list[list[str]]:
     return [[line[k] for k in kept] for line in cells]
 
 
-def markdown(rows: Iterable[Row]) -> str:
-    """The table in Markdown."""
-    head, *body = table(rows)
+def markdown(cells: list[list[str]]) -> str:
+    """A table, its headings first, in Markdown."""
+    head, *body = cells
     lines = [head, ["---"] + ["---:"] * (len(head) - 1), *body]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
 
@@ -96,7 +96,7 @@ def results(report: Report) -> dict[str, object]:
 def write(report: Report, folder: Path) -> None:
     """Write `report.html`, `table.md` and `results.json`, each whole or not at all."""
     exr.write_text(folder / "results.json", json.dumps(results(report), indent=1) + "\n")
-    exr.write_text(folder / "table.md", markdown(report.rows))
+    exr.write_text(folder / "table.md", markdown(table(report.rows)))
     exr.write_text(folder / "report.html", page(report))
 
 
@@ -169,13 +169,15 @@ def page(report: Report) -> str:
         rows = [r for r in report.rows if r.mode in modes]
         if not rows:
             continue
-        sections += [f"<h2>{html.escape(MODE_TEXT[mode])}</h2>\n" + _html_table([r for r in rows if r.mode == mode])
-                     for mode in modes if any(r.mode == mode for r in rows)]  # fmt: skip
+        for mode in modes:
+            if of_mode := [r for r in rows if r.mode == mode]:
+                sections.append(f"<h2>{html.escape(MODE_TEXT[mode])}</h2>\n{html_table(table(of_mode))}")
         if svg := curves(report.rows, modes):
             sections.append(f'<div class="curves">{svg}</div>')
     notes = "".join(f"<li>{html.escape(note)}</li>" for note in report.notes)
     environment = "\n".join(f"{k:16} {v}" for k, v in report.environment.items())
     return PAGE.format(
+        style=STYLE,
         title=html.escape(f"{report.scene} {report.size[0]}x{report.size[1]}"),
         sections="\n".join(sections),
         viewer=VIEWER if pictures else "",
@@ -209,14 +211,14 @@ def _pictures(report: Report) -> list[dict[str, object]]:
         row = picture.row
         budget = f" {row.budget_seconds:g} s" if row.budget_seconds else ""
         errors = [
-            f"{title} {_number(value)}"
+            f"{title} {number(value)}"
             for title, value in (("trimmed relMSE", row.relmse_trimmed), ("FLIP", row.flip), ("flicker", row.flicker))
             if value is not None
         ]
         entries.append(
             {
                 "name": f"{row.label}{' + denoiser' if row.denoised else ''}, {row.mode}{budget}",
-                "caption": ", ".join([f"{_number(row.spp)} spp", *errors]),
+                "caption": ", ".join([f"{number(row.spp)} spp", *errors]),
                 "image": _data_url(exr.to_srgb8(picture.rgb, exposure)),
                 "flip": None if picture.flip_map is None else _data_url(flip_colours(picture.flip_map)),
             }
@@ -228,8 +230,9 @@ def _data_url(rgb8: np.ndarray) -> str:
     return "data:image/png;base64," + base64.b64encode(exr.png_bytes(rgb8)).decode()
 
 
-def _html_table(rows: list[Row]) -> str:
-    head, *body = table(rows)
+def html_table(cells: list[list[str]]) -> str:
+    """A table, its headings first, in HTML."""
+    head, *body = cells
 
     def line(cells: list[str], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
@@ -237,7 +240,7 @@ def _html_table(rows: list[Row]) -> str:
     return "<table>" + line(head, "th") + "".join(line(cells, "td") for cells in body) + "</table>"
 
 
-def _number(value: float | int | None) -> str:
+def number(value: float | int | None) -> str:
     """Three significant digits, no exponent where it can be helped, empty for None."""
     if value is None:
         return ""
@@ -245,6 +248,25 @@ def _number(value: float | int | None) -> str:
         return str(int(value))
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; padding: 0 1rem; color: #222 }
+h1 { font-size: 1.6rem } h2 { font-size: 1.15rem; margin-top: 2rem }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 14px }
+th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #ddd }
+th:first-child, td:first-child { text-align: left } tr:hover td { background: #f4f6ff }
+.curves svg { max-width: 100%; height: auto }
+pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 13px }
+.controls label { margin-right: 1rem }
+#stage { position: relative; display: inline-block; cursor: ew-resize; margin-top: .6rem }
+#stage { max-width: 100%; overflow: auto }
+#stage img { display: block; image-rendering: pixelated; user-select: none; touch-action: none }
+#imgL { position: absolute; inset: 0 }
+#bar { position: absolute; top: 0; width: 1px; background: #fff; box-shadow: 0 0 3px #000; pointer-events: none }
+#gallery { display: flex; flex-wrap: wrap; gap: 1rem }
+#gallery figure { margin: 0; width: 270px; cursor: pointer } #gallery img { width: 100%; display: block }
+#gallery figcaption { font-size: 12.5px; line-height: 1.35 }
+"""
 
 VIEWER = """<h2>Pictures</h2>
 <p>Drag across the picture to compare. Keys 1 to 9 choose the right-hand picture; F switches to FLIP error maps.</p>
@@ -261,24 +283,7 @@ VIEWER = """<h2>Pictures</h2>
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>{title}: speed against error</title>
-<style>
-body {{ font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1200px; padding: 0 1rem; color: #222 }}
-h1 {{ font-size: 1.6rem }} h2 {{ font-size: 1.15rem; margin-top: 2rem }}
-table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 14px }}
-th, td {{ padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #ddd }}
-th:first-child, td:first-child {{ text-align: left }} tr:hover td {{ background: #f4f6ff }}
-.curves svg {{ max-width: 100%; height: auto }}
-pre {{ background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 13px }}
-.controls label {{ margin-right: 1rem }}
-#stage {{ position: relative; display: inline-block; cursor: ew-resize; margin-top: .6rem }}
-#stage {{ max-width: 100%; overflow: auto }}
-#stage img {{ display: block; image-rendering: pixelated; user-select: none; touch-action: none }}
-#imgL {{ position: absolute; inset: 0 }}
-#bar {{ position: absolute; top: 0; width: 1px; background: #fff; box-shadow: 0 0 3px #000; pointer-events: none }}
-#gallery {{ display: flex; flex-wrap: wrap; gap: 1rem }}
-#gallery figure {{ margin: 0; width: 270px; cursor: pointer }} #gallery img {{ width: 100%; display: block }}
-#gallery figcaption {{ font-size: 12.5px; line-height: 1.35 }}
-</style></head><body>
+<style>{style}</style></head><body>
 <h1>{title}</h1>
 {notes}
 {sections}

@@ -41,6 +41,18 @@ def parse_seconds(option: str, text: str) -> list[float]:
     return sorted(dict.fromkeys(seconds))
 
 
+def parse_crops(texts: list[str] | None, size: tuple[int, int]) -> list[tuple[int, int, int, int]]:
+    crops = []
+    for text in texts or []:
+        match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", text.replace(" ", ""))
+        x, y, w, h = map(int, match.groups()) if match else (0, 0, 0, 0)
+        if not match or min(w, h) < 1 or x + w > size[0] or y + h > size[1]:
+            raise InputError(f"--crop takes x,y,width,height in pixels within {size[0]}x{size[1]}, like 0,0,32,32; "
+                             f"got {text!r}")  # fmt: skip
+        crops.append((x, y, w, h))
+    return crops
+
+
 def parse_define(texts: list[str] | None) -> dict[str, str]:
     pairs = {}
     for text in texts or []:
@@ -198,10 +210,13 @@ def notes(reference: references.Reference, denoised: bool) -> list[str]:
 def print_rows(rows: list[benchmark.Row]) -> None:
     if not rows:
         return
-    lines = report.table(rows)
+    print_table(report.table(rows))
+    if n := sum(row.nonfinite for row in rows):
+        out.print(f"{n} non-finite samples or pixels were left out", markup=False)
+
+
+def print_table(lines: list[list[str]]) -> None:
     widths = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
     for line in lines:
         cells = [c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True))]
         out.print("  ".join(cells), soft_wrap=True, markup=False)
-    if n := sum(row.nonfinite for row in rows):
-        out.print(f"{n} non-finite samples or pixels were left out", markup=False)
