@@ -1,6 +1,9 @@
-"""Inputs of the networks. Only what a cache needs: incident radiance depends on position and direction alone."""
+"""Inputs of the networks. Only what a cache needs: incident radiance depends on position and direction alone, outgoing
+radiance on the surface as well."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +23,20 @@ def direction(w, degree: int) -> list:
     if degree < 0:
         return []
     return dr.sh_eval(mi.Vector3f(w), degree)
+
+
+def _blob_integral(u):
+    """Integral of the kernel ``15/16 (1 - u²)²`` from -1 to u."""
+    u = dr.clip(u, -1, 1)
+    u2 = dr.square(u)
+    return 0.5 + 15 / 16 * u * (1 + u2 * (u2 / 5 - 2 / 3))
+
+
+def one_blob(v, n_bins: int) -> list:
+    """A bump around `v` in [0, 1], as wide as two bins, integrated over each of `n_bins` equal bins (Müller et al.
+    2019, with a polynomial in place of the Gaussian)."""
+    edges = [_blob_integral(i - n_bins * v) for i in range(n_bins + 1)]
+    return [b - a for a, b in pairwise(edges)]
 
 
 def record_box(points: np.ndarray, fallback_min, fallback_max, quantile: float = 0.002):
