@@ -15,6 +15,7 @@ from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, light_sampler_of
 from mi_neural.transport.freezing import undisturbed
+from mi_neural.transport.identity import SceneWatch
 from mi_neural.transport.samples import PathSampler
 
 #: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (measured, README).
@@ -115,12 +116,12 @@ class _State:
         self.passes: dict = {}
         self.planned_spp: int | None = None
         self.ns_per_query = math.nan
-        self.facts: dict = {}  # what was measured of the scene `facts_key`
-        self.facts_key = None
+        self.facts: dict = {}  # what was measured of the scene
+        self.watch = SceneWatch()
         self.reset()
 
     def reset(self) -> None:
-        self.scene_key = self.signature = None
+        self.signature = None
         self.loaded: tuple | None = None  # file and scene of a cache that was read
         self.lights = None  # what chooses lights now; None: the scene itself
         self.images = 0
@@ -217,18 +218,13 @@ class CacheIntegrator(mi.SamplingIntegrator):
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
-        key = (id(scene), len(scene.shapes()), len(scene.emitters()))
-        if key != self.state.scene_key:
-            check_scene(scene, self.plugin)
-            if self.state.scene_key is not None:
-                self.reset()
-                self.state.passes.clear()  # recordings of the other scene
-            signature = scene_signature(scene)
-            if self.state.loaded is not None and self.state.loaded[1] != signature:
-                raise CacheFileError(_other_scene(*self.state.loaded[:1]))
-            self.state.scene_key, self.state.signature = key, signature
-        if key != self.state.facts_key:
-            self.state.facts, self.state.facts_key = {}, key
+        known = self.state.watch.parts
+        if self.state.watch.changed(scene) or self.state.signature is None:
+            try:
+                self._meet(scene, known is not self.state.watch.parts)
+            except ValueError:
+                self.state.watch.parts = known
+                raise
         if self.light_sampler is not None:
             # Settings are measured with lights chosen as they will be; an image rendered in several calls is one frame
             learn = (train and not self.state.image_open) or not self.state.facts
@@ -249,6 +245,19 @@ class CacheIntegrator(mi.SamplingIntegrator):
                     self._train_first(scene, sensor)
                 else:
                     self.cache.train(scene, sensor, self.state.lights, frames=self.train_steps)
+
+    def _meet(self, scene, is_another: bool) -> None:
+        """Begin with a scene: refuse it, or see what it is."""
+        check_scene(scene, self.plugin)
+        if self.state.signature is not None:
+            self.reset()
+        signature = scene_signature(scene)
+        if self.state.loaded is not None and self.state.loaded[1] != signature:
+            raise CacheFileError(_other_scene(*self.state.loaded[:1]))
+        self.state.signature = signature
+        if is_another:
+            self.state.passes.clear()  # recordings of the other scene
+            self.state.facts = {}
 
     def _train_first(self, scene, sensor, progress=None) -> None:
         auto = self.train_frames < 0
@@ -333,16 +342,17 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def measure_query(self, n: int = 2**18, directions: int = 8) -> float:
         """Nanoseconds per cache query: positions encoded once, `directions` queries each, all counted. Also kept for
         :meth:`statistics`."""
-        field = self.cache.field
+        field = self.cache.asked
         if field is None:
             raise RuntimeError(f"{self.plugin}: there is no cache yet; render an image or call train() first")
 
         @dr.freeze
         def run(field, seed):
             sampler = PathSampler.make(dr.arange(mi.UInt32, n), seed)
-            low, inv = field.box_min, field.box_inv_extent
+            plain = getattr(field, "field", field)
+            low, inv = plain.box_min, plain.box_inv_extent
             x = low + mi.Vector3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / inv
-            features = field.encode(x)
+            features = field.encode(x, mi.Normal3f(0, 0, 1))
 
             def ask(i, total, sampler):
                 w = mi.warp.square_to_uniform_sphere(sampler.next_2d())
@@ -423,7 +433,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         n_pixels = width * height
         mixture = dr.opaque(mi.Float, self.mixture(self.state.planned_spp or spp))
         box = film.rfilter().is_box_filter()
-        field = self.cache.field if self.needs_cache else None
+        field = self.cache.asked if self.needs_cache else None
 
         # A row of pixels at a time if one sample of all is too much, else several samples at a time
         done = 0
@@ -506,7 +516,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         lane = mi.UInt32(sampler.next_1d() * 2**24)
         own = PathSampler.make(lane, mi.UInt32(sampler.next_1d() * 2**24))
         mixture = mi.Float(self.mixture(self.state.planned_spp or sampler.sample_count()))
-        L, valid, extra = self.estimate(scene, self.state.lights, self.cache.field, own, ray, mixture, mi.Bool(active))
+        L, valid, extra = self.estimate(scene, self.state.lights, self.cache.asked, own, ray, mixture, mi.Bool(active))
         aovs = []
         for name in self.channels:
             aovs += list(extra[name]) if self.CHANNELS[name] == 3 else [extra[name]]

@@ -1,9 +1,13 @@
 """``nirc``: paths that end in a neural incident radiance cache."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural.caches.blend import BLENDS, Blend
+from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
 from mi_neural.transport import termination, vertex
 from mi_neural.transport.samples import PathSampler
@@ -24,6 +28,15 @@ class NIRCIntegrator(CacheIntegrator):
         self.termination = props.get("termination", "adaptive")
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self.gather_half = props.get("gather_half", 4.0)
+        self.cache.blend = props.get("blend", "ema")
+        measure = props.get("reliability", "evidence")
+        by_normal = props.get("reliability_normals", False)
+        self._check(self.cache.blend in BLENDS, f"blend is '{self.cache.blend}'; give one of: {', '.join(BLENDS)}")
+        self._check(measure in MEASURES, f"reliability is '{measure}'; give one of: {', '.join(MEASURES)}")
+        self.cache.reliability = Reliability(measure=measure, split_normals=by_normal)
+        rate = props.get("last_rate", 0.1 if self.cache.blend == "ema" else 1.0)
+        self._check(0 < rate <= 1, f"last_rate is {rate}; it must be greater than 0 and at most 1")
+        self.cache.training = replace(self.cache.training, last_rate=rate)
         self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
         self._check(self.light_samples == -1 or self.light_samples >= 1,
                     f"light_samples is {self.light_samples}; give -1 (chosen by noise) or at least 1")  # fmt: skip
@@ -94,7 +107,7 @@ class NIRCIntegrator(CacheIntegrator):
         bsdf = si.bsdf(ray)
         n_light = self.n_light
         cached = self.needs_cache and field is not None
-        features = field.encode(si.p) if cached else None
+        features = field.encode(si.p, si.sh_frame.n) if cached else None
         a_0 = termination.camera_spread(dr.squared_norm(si.p - ray.o), dr.dot(si.n, ray.d))
 
         # Of the traced samples, so many gather what lies far: as few as the share allows, to save the rest their rays
@@ -167,6 +180,11 @@ class NIRCIntegrator(CacheIntegrator):
         direct, residual = direct / n_light, residual / n_light
         L += dr.select(active, β * (direct + cache + residual), 0)
         channels = {"direct": β * direct, "cache": β * cache, "residual": β * residual}
+        if cached and isinstance(field, Blend):
+            sigma = field.sigma(si.p, si.sh_frame.n)
+            channels |= {"sigma": sigma, "preference": dr.select(sigma > 0.5, mi.Float(1), 0)}
+        else:
+            channels |= {"sigma": mi.Float(0), "preference": mi.Float(0)}
         return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
 
     def first_vertex(self, scene, sampler, ray, active):
@@ -259,7 +277,7 @@ class NIRCIntegrator(CacheIntegrator):
             β_next = vertex.finite(β * weight, active)
             stop = wide & ~delta & (bs.pdf <= SHARP_PDF)
             if cached:
-                L += dr.select(stop, β_next * field.query(field.encode(si.p), wo), 0)
+                L += dr.select(stop, β_next * field.query(field.encode(si.p, si.sh_frame.n), wo), 0)
             η *= bs.eta
             depth += 1
             followed = active & ~stop & (dr.max(β_next) > 0)
@@ -300,7 +318,7 @@ class NIRCIntegrator(CacheIntegrator):
         )
 
 
-NIRCIntegrator.CHANNELS = {"direct": 3, "cache": 3, "residual": 3}
+NIRCIntegrator.CHANNELS = {"direct": 3, "cache": 3, "residual": 3, "sigma": 1, "preference": 1}
 NIRCIntegrator.__doc__ = (
     r"""
     .. _integrator-nirc:
@@ -346,11 +364,30 @@ NIRCIntegrator.__doc__ = (
      * - gather_half
        - |float|
        - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)
+     * - blend
+       - |string|
+       - Which weights answer. ``ema``: their average, least noise, lags behind changes. ``fast``: those being trained.
+         ``reliability``: (1 - σ) average + σ trained, σ by place from how both agree with the training records; as
+         quick as ``fast`` where light changes, as still as ``ema`` elsewhere. ``switch``: the same with σ rounded to 0
+         or 1. For scenes that change; in still ones ``ema`` is best. (Default: ema)
+     * - reliability
+       - |string|
+       - How σ is found: ``evidence`` (a test whether the trained weights are better), ``correlation``, ``concordance``,
+         ``regression``. (Default: evidence)
+     * - reliability_normals
+       - |bool|
+       - Keep statistics apart by the six main directions of the normal. (Default: false)
+     * - last_rate
+       - |float|
+       - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be
+         quick)
     """
     + SHARED_KEYS.strip("\n")
     + r"""
 
-    Channels: ``direct``, ``cache``, ``residual`` (RGB each); with visible emission they sum to the image.
+    Channels: ``direct``, ``cache``, ``residual`` (RGB each); with visible emission they sum to the image. ``sigma``:
+    weight of the network being trained, at the first vertex; ``preference``: 1 where it exceeds 1/2. Its mean over a
+    frame's records is ``reliability`` in the statistics.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
     participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside

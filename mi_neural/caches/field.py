@@ -220,19 +220,30 @@ class Field:
     # -------------------------------------------------------------------------------------------------------------
     # Query
 
-    def encode(self, x, averaged: bool = True) -> list:
-        """What depends on the position alone: once per point, however many directions follow."""
-        weights = self.averaged if averaged else self.current
-        return list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+    def encode(self, x, n=None, averaged: bool = True) -> list:
+        """What depends on the position alone: once per point, however many directions follow. The normal `n` is not
+        asked for here; a :class:`~mi_neural.caches.blend.Blend` may."""
+        return self.features(self.averaged if averaged else self.current, x)
 
     def raw(self, features: list, w, averaged: bool = True):
         """The network's output over `scale`, not clamped."""
-        weights = self.averaged if averaged else self.current
-        return mi.Color3f(*weights([*features, *encoding.direction(w, self.shape.direction_degree)])) + 1
+        return self.output(self.averaged if averaged else self.current, features, w)
 
     def query(self, features: list, w, averaged: bool = True):
         """Radiance from direction `w` (unit, away from the surface) at the encoded position; never negative."""
-        value = dr.maximum(self.raw(features, w, averaged), 0)
+        return self.answer(self.averaged if averaged else self.current, features, w)
+
+    def features(self, weights: Weights, x) -> list:
+        """:meth:`encode` by any weights of this field's shape."""
+        return list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+
+    def output(self, weights: Weights, features: list, w):
+        """:meth:`raw` by any weights of this field's shape."""
+        return mi.Color3f(*weights([*features, *encoding.direction(w, self.shape.direction_degree)])) + 1
+
+    def answer(self, weights: Weights, features: list, w):
+        """:meth:`query` by any weights of this field's shape."""
+        value = dr.maximum(self.output(weights, features, w), 0)
         return dr.select(dr.isfinite(value), value, 0) * self.scale
 
     # -------------------------------------------------------------------------------------------------------------

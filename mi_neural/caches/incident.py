@@ -21,7 +21,9 @@ from ..transport.freezing import can_freeze, undisturbed
 from ..transport.records import TrainingRecords, trace_training_paths
 from ..transport.samples import PathSampler
 from . import encoding, loss
+from .blend import Blend
 from .field import Field, FieldShape
+from .reliability import Reliability
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
 TARGET_MAX = 1e4
@@ -41,6 +43,7 @@ class Training:
     epsilon          of that loss, over the squared mean target of the scene
     learning_rate    of Adam, at the start; see `rate`
     ema_decay        longest horizon of the averaged copy: 1 / (1 - ema_decay) steps
+    last_rate        share of the learning rate that it falls to
     """
 
     n_paths: int = 4096
@@ -50,6 +53,7 @@ class Training:
     epsilon: float = 0.03
     learning_rate: float = 1e-2
     ema_decay: float = 0.99
+    last_rate: float = 0.1
 
     def __post_init__(self):
         for name, least in (("n_paths", 1), ("n_vertices", 2), ("n_tail", 1), ("n_local", 1)):
@@ -59,24 +63,26 @@ class Training:
             raise ValueError(f"learning_rate is {self.learning_rate}; it must be greater than 0")
         if not 0 <= self.ema_decay <= 1:
             raise ValueError(f"ema_decay is {self.ema_decay}; it must lie in [0, 1]")
+        if not 0 < self.last_rate <= 1:
+            raise ValueError(f"last_rate is {self.last_rate}; it must be greater than 0 and at most 1")
 
     def rate(self, step: int) -> float:
-        """Learning rate of a step: a hundred steps at full speed, then falling as 1/t to a tenth."""
-        return self.learning_rate * max(0.1, 1 / (1 + step / 100))
+        """Learning rate of a step: a hundred steps at full speed, then falling as 1/t to `last_rate` of it."""
+        return self.learning_rate * max(self.last_rate, 1 / (1 + step / 100))
 
     def decay(self, step: int) -> float:
         """EMA decay of a step: the average spans the last seventh of the steps so far, at most the full horizon."""
         return min(self.ema_decay, 1 - 1 / (0.15 * step + 1))
 
 
-def trace_records(scene, sensor, field: Field | None, training: Training, seed, lights=None):
-    """Fresh training records, targets ending in the averaged cache (in nothing without a field); `lights` as in
+def trace_records(scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None):
+    """Fresh training records, targets ending in the cache as it is asked (in nothing without one); `lights` as in
     ``vertex.emitted``."""
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
     def from_cache(si, bsdf, active, sampler):
-        return reflect(field, field.encode(si.p), si, bsdf, training.n_tail, sampler, active)
+        return reflect(field, field.encode(si.p, si.sh_frame.n), si, bsdf, training.n_tail, sampler, active)
 
     tail = from_cache if field is not None else (lambda si, bsdf, active, sampler: mi.Color3f(0))
     return trace_training_paths(scene, sensor, sampler, training.n_paths, training.n_vertices, tail, lights)
@@ -103,9 +109,8 @@ def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
     return total * (1 / n)
 
 
-def local_mean(field: Field, records: TrainingRecords, n: int, sampler):
+def local_mean(field: Field, features: list, records: TrainingRecords, n: int, sampler):
     """Mean prediction over the cosine-weighted hemisphere at each record, over `scale`, from `n` queries."""
-    features = field.encode(records.position)
     frame = mi.Frame3f(mi.Normal3f(records.normal))
 
     def add(i, total, sampler):
@@ -118,25 +123,35 @@ def local_mean(field: Field, records: TrainingRecords, n: int, sampler):
     return total * (1 / n)
 
 
-def learn(field: Field, records: TrainingRecords, training: Training, seed, learning_rate, decay):
-    """One training step on the given records. Returns (loss, mean target, mean |prediction|), 1-wide, the means over
-    `scale`."""
+def learn(cache: Field | Blend, records: TrainingRecords, training: Training, seed, learning_rate, decay):
+    """One training step on the given records; a blend scores its predictors on them first. Returns (loss, mean target,
+    mean |prediction|), 1-wide, the means over `scale`."""
+    blend = cache if isinstance(cache, Blend) else None
+    field = cache.field if blend else cache
     n_valid = dr.maximum(dr.count(records.valid), 1)
     y = dr.select(records.valid, dr.clip(records.target / field.scale, 0, TARGET_MAX), 0)
     with dr.suspend_grad():
         mean_target = dr.sum(loss.luminance(y)) / n_valid
         field.mean = dr.lerp(mean_target, field.mean, decay)
         sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
-        mean_local = local_mean(field, records, training.n_local, sampler)
+        features = field.encode(records.position)
+        mean_local = local_mean(field, features, records, training.n_local, sampler)
         dr.eval(y, mean_local, field.mean)
 
     p = field.predict(records.position, records.direction)
+    if blend:
+        with dr.suspend_grad():
+            current, averaged = dr.maximum(dr.detach(p), 0), field.query(features, records.direction)
+            blend.observe(records, y * field.scale, current * field.scale, averaged)
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
     total = dr.sum(dr.select(records.valid, error, 0)) / n_valid
     mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(dr.detach(p))), 0)) / n_valid
     dr.schedule(mean_prediction)
     field.step(total, learning_rate, decay)
+    if blend:
+        with dr.suspend_grad():
+            blend.refresh()
     return dr.detach(total), mean_target, mean_prediction
 
 
@@ -154,8 +169,12 @@ class IncidentCache:
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
 
-    def __init__(self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0):
+    def __init__(
+        self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0, *, blend: str = "ema",
+        reliability: Reliability | None = None,
+    ):  # fmt: skip
         self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
+        self.blend, self.reliability = blend, reliability
         self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
         self._probe = dr.freeze(self._probe_plain, auto_opaque=False)
         self._sensor_freezes: dict[int, bool] = {}
@@ -164,6 +183,7 @@ class IncidentCache:
     def reset(self) -> None:
         """Forget all that was learned. Compiled kernels are kept."""
         self.field: Field | None = None
+        self._blend: Blend | None = None
         self.steps = 0
         self.rate_factor = 1.0
         self.history: list[float] = []
@@ -175,6 +195,15 @@ class IncidentCache:
 
     # -------------------------------------------------------------------------------------------------------------
 
+    @property
+    def asked(self) -> Field | Blend | None:
+        """What answers queries: the averaged weights, or the blend of them with those being trained."""
+        if self.field is None or self.blend == "ema":
+            return self.field
+        if self._blend is None or self._blend.field is not self.field:
+            self._blend = Blend(self.field, self.blend, self.reliability)
+        return self._blend
+
     def freezes(self, sensor) -> bool:
         """Whether functions of this sensor can be frozen, see :func:`can_freeze`; tried once per sensor."""
         if id(sensor) not in self._sensor_freezes:
@@ -184,12 +213,13 @@ class IncidentCache:
     def _probe_plain(self, scene, sensor, lights, seed):
         return trace_records(scene, sensor, None, self.training, seed, lights)
 
-    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, cache, seed, learning_rate, decay):
         with dr.suspend_grad():
-            records, n_bad = trace_records(scene, sensor, field, self.training, seed, lights)
+            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
             dr.eval(records, n_bad)
-        outputs = learn(field, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
-        return *outputs, dr.count(records.valid), n_bad
+        outputs = learn(cache, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
+        sigma = cache.mean_sigma() if isinstance(cache, Blend) else mi.Float(0)
+        return *outputs, dr.count(records.valid), n_bad, sigma
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -221,10 +251,10 @@ class IncidentCache:
         frame = self._frame if self.freezes(sensor) else self._frame_plain
         with undisturbed():
             outputs = frame(
-                scene, sensor, lights, self.field, mi.UInt32(self._seed(self.steps)),
+                scene, sensor, lights, self.asked, mi.UInt32(self._seed(self.steps)),
                 dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
             )  # fmt: skip
-        value, mean_target, mean_prediction, n_valid, n_bad = (v[0] for v in outputs)
+        value, mean_target, mean_prediction, n_valid, n_bad, sigma = (v[0] for v in outputs)
         self.steps += 1
         self.field.steps = self.steps
         s = self.statistics
@@ -232,6 +262,8 @@ class IncidentCache:
         s["loss"] = value
         s["records"] += int(n_valid)
         s["nonfinite"] += int(n_bad)
+        if self.blend != "ema":
+            s["reliability"] = sigma
         healthy = self._watch(value, mean_target, mean_prediction)
         if healthy and mean_target > max(self.BRIGHTER, 10 * mean_prediction):
             # Another light: what was measured in the old one is void, and the schedule of rates begins anew
@@ -267,6 +299,8 @@ class IncidentCache:
     def recover(self) -> None:
         """Go back to the last good weights, with half the learning rate."""
         self.field.restore(self._good)
+        if self._blend is not None:
+            self._blend.refresh()
         self.rate_factor *= 0.5
         self.statistics["recoveries"] += 1
         mi.Log(
@@ -282,6 +316,7 @@ class IncidentCache:
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
             None if self.field is None else (self.field.snapshot(), mi.Float(self.field.mean)),
+            None if self._blend is None else self._blend.snapshot(),
             self.steps, self.rate_factor, list(self.history), self._good, dict(self.statistics),
         )  # fmt: skip
 
@@ -293,10 +328,12 @@ class IncidentCache:
             field.reset()
             self.field = field
             return
-        weights, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
+        weights, blend, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
         if weights is not None:
             self.field.restore(weights[0])
             self.field.mean = weights[1]
+            if self._blend is not None and blend is not None:
+                self._blend.restore(blend)
             self.levels = []
             self.field.steps = self.steps
 

@@ -15,5 +15,8 @@ class SceneWatch:
     def changed(self, scene) -> bool:
         """Whether `scene` is another one than in the call before; the first time it is."""
         parts = (*scene.shapes(), *scene.emitters())
-        known, self.parts = self.parts, parts
-        return known is None or len(known) != len(parts) or any(a is not b for a, b in zip(known, parts, strict=True))
+        known = self.parts
+        if known is not None and len(known) == len(parts) and all(a is b for a, b in zip(known, parts, strict=True)):
+            return False
+        self.parts = parts
+        return True

@@ -1,0 +1,113 @@
+"""Queries that trust the weights being trained where the light has changed, and their average elsewhere.
+
+``L = (1 - σ) f_averaged + σ f_current``, with σ per cell from :mod:`.reliability`. Where σ is 0 or 1, only one of the
+two is evaluated.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .field import Field, Weights, own_copy
+from .reliability import Reliability, ReliabilityGrid
+
+BLENDS = ("ema", "fast", "switch", "reliability")
+#: Weights this close to 0 or 1 count as that, so that one network need not be asked.
+NEGLIGIBLE = 0.02
+
+
+class Blend:
+    """A field's two predictors as one. A PyTree, with the queries of a :class:`~mi_neural.caches.field.Field`.
+
+    field   the field, trained as ever
+    fast    a copy of the weights being trained, for queries
+    grid    σ by place; none in the mode ``fast``
+
+    `mode`: ``fast`` (σ = 1), ``switch`` (σ rounded to 0 or 1) or ``reliability``.
+    """
+
+    DRJIT_STRUCT = {"field": object, "fast": object, "grid": object}  # noqa: RUF012
+
+    def __init__(self, field: Field, mode: str, constants: Reliability | None = None):
+        self.field, self.mode = field, mode
+        self.fast = Weights(field.shape, field.seed)
+        self.grid = None
+        if mode != "fast":
+            self.grid = ReliabilityGrid(*field.box, constants, scale=float(field.scale[0]))
+        self.refresh()
+        dr.eval(self.fast)
+
+    def refresh(self) -> None:
+        """Bring `fast` up to date with training. May be frozen."""
+        self.fast.assign({k: own_copy(v) for k, v in self.field.optimizer.items()})
+        self.fast.pack()
+
+    def snapshot(self) -> dict:
+        """The grid as it is now, for :meth:`restore`."""
+        if self.grid is None:
+            return {}
+        return {k: _copies(getattr(self.grid, k)) for k in self.grid.DRJIT_STRUCT}
+
+    def restore(self, state: dict) -> None:
+        """Take the grid back to a snapshot, and `fast` to what the field holds."""
+        for k, v in state.items():
+            setattr(self.grid, k, _copies(v))
+        self.refresh()
+
+    # -------------------------------------------------------------------------------------------------------------
+    # Query
+
+    def sigma(self, x, n):
+        """Weight of the fast predictor at points with unit normals."""
+        if self.grid is None:
+            return mi.Float(1)
+        sigma = self.grid.sigma_at(x, n)
+        if self.mode == "switch":
+            return dr.select(sigma > 0.5, mi.Float(1), 0)
+        return dr.select(sigma < NEGLIGIBLE, 0, dr.select(sigma > 1 - NEGLIGIBLE, 1, sigma))
+
+    def encode(self, x, n) -> tuple:
+        """What depends on the position alone, of either predictor where it counts."""
+        if self.grid is None:
+            return None, None, self.field.features(self.fast, x)
+        sigma = self.sigma(x, n)
+        return sigma, *(
+            _where(asks, (mi.Point3f(x),), lambda x, w=weights: tuple(self.field.features(w, x)), self._n_features)
+            for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))
+        )
+
+    @property
+    def _n_features(self) -> int:
+        return self.field.shape.n_levels * self.field.shape.n_features
+
+    def query(self, features: tuple, w):
+        """Radiance from direction `w` at the encoded position; never negative."""
+        sigma, averaged, fast = features
+        if sigma is None:
+            return self.field.answer(self.fast, list(fast), w)
+        answers = [
+            mi.Color3f(*_where(asks, (mi.Vector3f(w), *values),
+                               lambda w, *v, weights=weights: tuple(self.field.answer(weights, list(v), w)), 3))
+            for asks, values, weights in ((sigma < 1, averaged, self.field.averaged), (sigma > 0, fast, self.fast))
+        ]  # fmt: skip
+        return (1 - sigma) * answers[0] + sigma * answers[1]
+
+    def mean_sigma(self):
+        """Mean σ over the latest records, 1-wide."""
+        return mi.Float(1) if self.grid is None else self.grid.mean_sigma()
+
+    def observe(self, records, y, current, averaged) -> None:
+        """Score both predictions (radiance, made before the step) against targets `y`."""
+        if self.grid is not None:
+            self.grid.update(records.position, records.normal, records.valid, y, current, averaged)
+
+
+def _where(active, args: tuple, function, n_outputs: int) -> tuple:
+    """``function(*args)``, a tuple of floats, where `active`; 0 elsewhere. Packets with no active lane skip it."""
+    nothing = lambda *_: tuple(mi.Float(0) for _ in range(n_outputs))  # noqa: E731
+    return dr.if_stmt(args, active, function, nothing, label="predictor")
+
+
+def _copies(value):
+    return [_copies(v) for v in value] if isinstance(value, list) else type(value)(value)
