@@ -14,6 +14,7 @@ from mi_neural.lights.sampling import VisibleLights
 from mi_neural.lights.table import LightTable
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.transport import vertex
+from mi_neural.transport.identity import SceneWatch
 from mi_neural.transport.samples import PathSampler
 
 MODES = ("sampled", "neural")
@@ -157,7 +158,7 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
         """Forget what was learned; the next image trains anew."""
         self.light_sampler.reset()
         self.cache.reset()
-        self.scene_key = None
+        self.watch = SceneWatch()
         self.lights = None  # what chooses lights; None: the scene itself
         self.unshadowed: UnshadowedLights | None = None
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
@@ -172,12 +173,12 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
 
     def prepare_lights(self, scene, sensor, train: bool = True) -> None:
         """Train as the keys say, and have all ready for an image of `scene` as it is now."""
-        if (key := _key(scene)) != self.scene_key:
+        if not self.watch.knows(scene):
             check_scene(scene, self.plugin)
-            if self.scene_key is not None:
+            if self.watch.parts is not None:
                 self.reset()
             self.mixed, self.mirrors = delta_lobes(scene)
-            self.scene_key = key
+            self.watch.changed(scene)
         with dr.resume_grad():
             self.lights = self.light_sampler.lights(scene, sensor, train)
             if self.kind == "radiance":
@@ -237,7 +238,7 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
             self.entered = False
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        if not self.entered and self.scene_key != _key(scene):  # inside another integrator
+        if not self.entered and not self.watch.knows(scene):  # inside another integrator
             self.prepare_lights(scene, scene.sensors()[0])
         ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active) & (self.depth_limit > 0)
 
@@ -331,11 +332,6 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
             f"  light_samples = {self.light_samples},\n  max_depth = {self.max_depth},\n"
             f"  light_sampler = {self.light_sampler.to_string()}\n]"
         )
-
-
-def _key(scene) -> tuple:
-    """What tells scenes apart."""
-    return id(scene), len(scene.shapes()), len(scene.emitters())
 
 
 def delta_lobes(scene) -> tuple[bool, bool]:

@@ -147,6 +147,20 @@ def test_checkpoint_takes_the_grid_back():
     assert cache.asked.grid.updates[0] == 0
 
 
+def test_rollback_brings_back_the_field_that_a_restart_replaced():
+    scene, sensor = load("point_lit_sphere", 8)
+    cache = IncidentCache(Training(n_paths=64), SHAPE, blend="reliability")
+    cache.train(scene, sensor, frames=3)
+    field, scale, kept = cache.field, cache.field.scale[0], cache.checkpoint()
+    params = mi.traverse(scene)
+    params["light.intensity.value"] = 1e4 * params["light.intensity.value"]
+    params.update()
+    cache.train(scene, sensor, frames=2)
+    assert cache.field is not field and cache.field.scale[0] > 1e3 * scale
+    cache.rollback(kept)
+    assert cache.field is cache.asked.field is field and field.scale[0] == scale
+
+
 # ---------------------------------------------------------------- nirc
 
 

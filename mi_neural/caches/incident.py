@@ -315,7 +315,7 @@ class IncidentCache:
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field.snapshot(), mi.Float(self.field.mean)),
+            None if self.field is None else (self.field, self.field.snapshot(), mi.Float(self.field.mean)),
             None if self._blend is None else self._blend.snapshot(),
             self.steps, self.rate_factor, list(self.history), self._good, dict(self.statistics),
         )  # fmt: skip
@@ -330,8 +330,9 @@ class IncidentCache:
             return
         weights, blend, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
         if weights is not None:
-            self.field.restore(weights[0])
-            self.field.mean = weights[1]
+            self.field, arrays, mean = weights  # training may have begun a new one
+            self.field.restore(arrays)
+            self.field.mean = mean
             if self._blend is not None and blend is not None:
                 self._blend.restore(blend)
             self.levels = []

@@ -12,11 +12,19 @@ class SceneWatch:
     def __init__(self):
         self.parts: tuple | None = None
 
+    def knows(self, scene) -> bool:
+        """Whether `scene` is the one that was last looked at."""
+        parts = _parts(scene)
+        known = self.parts
+        return known is not None and len(known) == len(parts) and all(a is b for a, b in zip(known, parts, strict=True))
+
     def changed(self, scene) -> bool:
         """Whether `scene` is another one than in the call before; the first time it is."""
-        parts = (*scene.shapes(), *scene.emitters())
-        known = self.parts
-        if known is not None and len(known) == len(parts) and all(a is b for a, b in zip(known, parts, strict=True)):
+        if self.knows(scene):
             return False
-        self.parts = parts
+        self.parts = _parts(scene)
         return True
+
+
+def _parts(scene) -> tuple:
+    return (*scene.shapes(), *scene.emitters())
