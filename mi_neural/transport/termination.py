@@ -5,7 +5,10 @@ Spread: Müller et al. 2021 (NRC), section 3.4, after Bekaert et al. 2003. Balan
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
+import mitsuba as mi
 
 
 def camera_spread(distance_squared, cos_theta):
@@ -34,3 +37,42 @@ def balanced_probability(n_cache: int, pdf):
     """
     p_f = n_cache * dr.inv_pi
     return p_f / (p_f + pdf)
+
+
+@dataclass
+class PathSpread:
+    """The spread of a path as it grows. A PyTree, for loops.
+
+    root       square root of the spread a since the first vertex with a smooth lobe
+    a_0        that of the pixel there
+    distance   from the camera to there, along mirrors and glass
+    started    whether the path has come so far
+    """
+
+    root: mi.Float
+    a_0: mi.Float
+    distance: mi.Float
+    started: mi.Bool
+
+    @staticmethod
+    def start(n: int) -> PathSpread:
+        """`n` paths at the camera."""
+        return PathSpread(dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.zeros(mi.Bool, n))
+
+    def arrive(self, si, ray, pdf, delta, smooth) -> PathSpread:
+        """After `ray`, sampled with `pdf` over solid angle or by a `delta` lobe, met `si`, which is `smooth` or not."""
+        cos_theta = dr.dot(si.n, ray.d)
+        grows = self.started & ~delta & si.is_valid()
+        root = self.root + dr.select(grows, segment_spread(dr.square(si.t), pdf, cos_theta), 0)
+        distance = self.distance + dr.select(self.started | ~si.is_valid(), 0, si.t)
+        a_0 = dr.select(self.started, self.a_0, camera_spread(dr.square(distance), cos_theta))
+        return PathSpread(root, a_0, distance, self.started | smooth)
+
+    def exceeds(self, threshold):
+        """See :func:`exceeds`; with a threshold of 0 wherever there is a smooth lobe."""
+        wide = exceeds(self.root, self.a_0, threshold)
+        return self.started & (wide | (threshold == 0))
+
+    def restarted(self, where) -> PathSpread:
+        """As wide as nothing, where `where`."""
+        return PathSpread(dr.select(where, 0, self.root), self.a_0, self.distance, mi.Bool(self.started))
