@@ -136,13 +136,13 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
         sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
         features = field.encode(records.position)
         mean_local = local_mean(field, features, records, training.n_local, sampler)
-        dr.eval(y, mean_local, field.mean)
+        averaged = field.query(features, records.direction) if blend else None  # in the kernel that encodes
+        dr.eval(y, mean_local, averaged, field.mean)
 
     p = field.predict(records.position, records.direction)
     if blend:
         with dr.suspend_grad():
-            current, averaged = dr.maximum(dr.detach(p), 0), field.query(features, records.direction)
-            blend.observe(records, y * field.scale, current * field.scale, averaged)
+            blend.observe(records, y * field.scale, dr.maximum(dr.detach(p), 0) * field.scale, averaged)
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
     total = dr.sum(dr.select(records.valid, error, 0)) / n_valid
