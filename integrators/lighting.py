@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import weakref
+
 import drjit as dr
 import mitsuba as mi
 
 from mi_neural.integrators.checks import sensor_of
+from mi_neural.transport.freezing import can_freeze, undisturbed
+from mi_neural.transport.identity import SceneWatch
 
 LIGHT_SAMPLER_KEY = """
      * - light_sampler
@@ -26,10 +30,19 @@ def light_sampler_of(props):
     return given
 
 
+class _Images:
+    """Frozen functions that render images of one scene."""
+
+    def __init__(self):
+        self.scene, self.frozen, self.sensors = SceneWatch(), {}, {}
+
+
 class LightSamplingIntegrator(mi.SamplingIntegrator):
     """Base of the integrators that learn nothing but what their light sampler learns. Subclasses give `sample`.
 
-    `lights` is what chooses lights in the image being rendered; None: the scene itself.
+    `lights` is what chooses lights in the image being rendered; None: the scene itself. Images without gradients are
+    rendered by a frozen function, which is traced once and not for each image: in a scene of a thousand shapes that
+    takes longer than a sample a pixel.
     """
 
     def __init__(self, props):
@@ -37,6 +50,7 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         self.plugin = props.plugin_name()
         self.light_sampler = light_sampler_of(props)
         self.lights, self.entered = None, False
+        self.images = _Images()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         sensor = sensor_of(scene, sensor, self.plugin)
@@ -45,9 +59,47 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         self.entered = True
         try:
             self.prepare_lights(scene, sensor)
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
+            frozen = None if _differentiates() else self._frozen_image(scene, sensor, spp)
+            if frozen is None:
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
+            return self._replay(frozen, scene, sensor, seed, spp, develop, evaluate)
         finally:
             self.entered = False
+
+    def _frozen_image(self, scene, sensor, spp: int):
+        """A frozen function that renders `spp` samples a pixel and gives the film's raw content; None if `sensor` does
+        not let it be frozen."""
+        if self.images.scene.changed(scene):
+            self.images.frozen.clear()
+            self.images.sensors.clear()
+        if id(sensor) not in self.images.sensors:
+            self.images.sensors[id(sensor)] = sensor, can_freeze(sensor)  # held, so that no other has its id
+        if not self.images.sensors[id(sensor)][1]:
+            return None
+        film = sensor.film()
+        keys = tuple((k, v) for k, v in vars(self).items() if isinstance(v, (int, float, str)))
+        key = (id(sensor), *film.crop_size(), *film.crop_offset(), spp or sensor.sampler().sample_count(), keys)
+        if key not in self.images.frozen:
+            # Held weakly: an attribute that changes would have it recorded anew
+            self.images.frozen[key] = dr.freeze(_image_of(weakref.ref(self), spp), auto_opaque=False)
+        return self.images.frozen[key]
+
+    def _replay(self, frozen, scene, sensor, seed, spp, develop, evaluate):
+        film, sampler = sensor.film(), sensor.sampler()
+        if spp:
+            sampler.set_sample_count(spp)
+        # Their state is an argument as well
+        film.prepare(self.aov_names())
+        sampler.seed(0, 1)
+        with undisturbed():
+            raw = frozen(scene, sensor, self.lights, dr.opaque(mi.UInt32, int(mi.UInt32(seed)[0])))
+        film.prepare(self.aov_names())
+        film.put_block(mi.ImageBlock(raw, film.crop_offset(), film.rfilter()))
+        sampler.seed(0, 1)
+        result = film.develop() if develop else mi.TensorXf()
+        if evaluate:
+            dr.eval(result)
+        return result
 
     def ready(self, scene) -> None:
         """Have lights chosen also where another integrator (``aov``) asks for samples and no image is rendered."""
@@ -78,8 +130,9 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         """Compile all that a render call with `spp` needs. Who has learned nothing yet has not afterwards."""
         sensor = sensor_of(scene, sensor, self.plugin)
         fresh = not self.statistics().get("visibility_steps")
-        for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
-            dr.eval(self.render(scene, sensor, 0, spp))
+        with dr.suspend_grad():
+            for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
+                dr.eval(self.render(scene, sensor, 0, spp))
         dr.sync_thread()
         if fresh:
             self.reset()
@@ -88,3 +141,28 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         """Facts since the last reset: what the light sampler says of itself."""
         facts = self.light_sampler.statistics() if self.light_sampler is not None else {}
         return {"seconds_train": facts.get("seconds_visibility", 0.0), **facts}
+
+
+def _differentiates() -> bool:
+    """Whether gradients are being tracked."""
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    return dr.grad_enabled(x)
+
+
+def _image_of(integrator, spp: int):
+    """A function that renders an image by `integrator`, a weak reference, to be frozen."""
+
+    def image(scene, sensor, lights, seed):
+        it = integrator()
+        known, it.lights = it.lights, lights
+        try:
+            mi.SamplingIntegrator.render(it, scene, sensor, seed, spp, False, False)
+        finally:
+            it.lights = known
+        raw = sensor.film().develop(raw=True)
+        sensor.sampler().seed(0, 1)  # or its state would be computed, by half of the work anew
+        dr.eval(raw)
+        return raw
+
+    return image

@@ -294,8 +294,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             w_camera = mi.Color3f(w_camera)
 
             # ------------- Where that was in the frame before -------------
-            before, found = self.reproject(si, past, past_camera, size, border, pixel, pinhole)
-            found &= usable
+            before, found = self.reproject(si, past, past_camera, size, border, pixel, pinhole, usable)
 
             # ----------------- Initial candidates, one ray ----------------
             kept = self.initial(scene, lights, power, si, found, sampler, usable)
@@ -390,8 +389,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         n_candidates = self.initial_candidates
         n, transmits = vertex.receiver(si, si.bsdf())
 
-        def draw(lights, active):
-            lights = _remembering(lights, si, n, transmits, active)
+        def draw(lights, sampler, active):
+            lights = _remembering(lights, si, n, transmits)
 
             def candidate(i, kept, sampler):
                 u = (mi.Float(i) + sampler.next_1d()) * (1 / n_candidates)
@@ -402,37 +401,57 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
                 kept = reservoir.update(kept, choice.index, uv, target * choice.weight, target, sampler.next_1d())
                 return i + 1, kept, sampler
 
-            return dr.while_loop(
+            _, kept, sampler = dr.while_loop(
                 (mi.UInt32(0), Reservoir.empty(dr.width(si)), sampler), lambda i, *_: active & (i < n_candidates),
                 candidate, label="initial candidates",
-            )[1]  # fmt: skip
+            )  # fmt: skip
+            return kept, sampler
 
         if self.candidates == "nvc" and self.nvc_where == "disoccluded":
-            kept, other = draw(power, active & found), draw(lights, active & ~found)
-            kept = dr.select(found, kept, other)
+            kept, sampler = draw(power, sampler, active & found)
+            # A loop of at most one round: nothing is computed where no pixel of a packet is new
+            _, kept, sampler = dr.while_loop(
+                (active & ~found, kept, sampler), lambda new, *_: new,
+                lambda new, _, sampler: (mi.Bool(False), *draw(lights, sampler, new)), label="disoccluded",
+            )  # fmt: skip
         else:
-            kept = draw(lights, active)
+            kept, sampler = draw(lights, sampler, active)
         kept = replace(reservoir.finish(kept), M=dr.select(active, mi.Float(1), 0))
         lit = active & (kept.W > 0)
         _, p_light = self.contribution(scene, power, si, kept.index, kept.uv, lit)
         lit &= _visible(scene, si, p_light, lit)
         return replace(kept, W=dr.select(lit, kept.W, 0), target=dr.select(lit, kept.target, 0))
 
-    def reproject(self, si, past, past_camera, size, border, pixel, pinhole):
-        """Pixel of the frame before that saw the point `si`: (its number, whether it did)."""
+    def reproject(self, si, past, past_camera, size, border, pixel, pinhole, active):
+        """Pixel of the frame before that saw the point `si`, or one beside it that saw the same surface, as at edges:
+        (its number, whether there is one)."""
         to_film, origin = past_camera
-        before, inside = pixel, mi.Bool(True)
+        width, height = (n + 2 * border for n in size)
+        x, y, inside = mi.Int32(pixel % width), mi.Int32(pixel // width), mi.Bool(active)
         distance = dr.norm(si.p - origin)
         if pinhole:
             film = to_film @ mi.Vector3f(si.p - origin)
             inv_z = dr.rcp(dr.select(film.z > 0, film.z, 1))
-            x, y = film.x * inv_z * size[0] + border, film.y * inv_z * size[1] + border
-            width, height = (n + 2 * border for n in size)
-            inside = (film.z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            before = mi.UInt32(dr.select(inside, x, 0)) + mi.UInt32(dr.select(inside, y, 0)) * width
-        there = dr.gather(mi.SurfaceInteraction3f, past.surface, before, inside)
-        inside &= dr.gather(mi.Bool, past.usable, before, inside)
-        return before, inside & self.alike(si, distance, there, dr.norm(there.p - origin))
+            u, v = film.x * inv_z * size[0] + border, film.y * inv_z * size[1] + border
+            inside &= (film.z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            x, y = mi.Int32(dr.select(inside, u, 0)), mi.Int32(dr.select(inside, v, 0))
+
+        def look(x, y, inside):
+            inside = inside & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+            lane = mi.UInt32(dr.select(inside, x + y * width, 0))
+            there = dr.gather(mi.SurfaceInteraction3f, past.surface, lane, inside)
+            seen = inside & dr.gather(mi.Bool, past.usable, lane, inside)
+            return lane, seen & self.alike(si, distance, there, dr.norm(there.p - origin))
+
+        def beside(k, _, found):
+            lane, found = look(x + dr.select(k < 2, 2 * k - 1, 0), y + dr.select(k < 2, 0, 2 * k - 5), inside)
+            return k + 1, lane, found
+
+        before, found = look(x, y, inside)
+        _, before, found = dr.while_loop(
+            (mi.Int32(0), before, found), lambda k, _, found: inside & ~found & (k < 4), beside, label="pixels beside"
+        )
+        return before, found
 
     def alike(self, a, distance_a, b, distance_b):
         """Whether two surfaces may share light samples: their normals and distances from the camera are close."""
@@ -533,14 +552,11 @@ def _facts(table) -> tuple:
     return (table.n_lights, table.any_flat, table.all_flat, table.all_plain, tuple(table.kinds))
 
 
-def _remembering(lights, si, n, transmits, active):
-    """The same choice of lights at the same surface, again and again; a network is asked once, where `active`."""
+def _remembering(lights, si, n, transmits):
+    """The same choice of lights at the same surface, again and again; a network is asked once."""
     if not hasattr(lights, "weights"):
         return lights
-    weights = dr.if_stmt(
-        (si.p, n, transmits), active, lambda *at: tuple(lights.weights(*at)),
-        lambda *_: (mi.Float(0),) * lights.groups.n_groups, label="light weights",
-    )  # fmt: skip
+    weights = lights.weights(si.p, n, transmits)
     lights = copy.copy(lights)
     lights.weights = lambda *_: weights
     return lights

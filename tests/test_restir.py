@@ -146,6 +146,28 @@ def test_reuse_lowers_the_noise():
     assert frames < 0.5 * alone and pixels < 0.8 * alone and both < 0.5 * alone
 
 
+def test_nvc_only_where_nothing_is_known_is_nvc_there():
+    """In the first frame, which knows nothing, both choices are the same, sample by sample; later, in the mean."""
+    scene, images = diffuse_scene(16), {}
+    for where in ("everywhere", "disoccluded"):
+        it = integrator(candidates="nvc", nvc_where=where, light_sampler={**NVC, "freeze": True})
+        images[where] = last_frames(scene, it, 2, 1)
+        images[where + " later"] = last_frames(scene, it, 16, 4)
+    np.testing.assert_allclose(images["disoccluded"], images["everywhere"], rtol=1e-3, atol=1e-4)
+    assert_same_mean(images["disoccluded later"], images["everywhere later"], "disoccluded", relative=1e-5)
+
+
+def test_edges_know_what_the_pixel_beside_saw():
+    """Samples of a pixel at an edge lie now on this side of it, now on that."""
+    scene, it = diffuse_scene(32), integrator(spatial_samples=0)
+    for k in range(8):
+        mi.render(scene, integrator=it, spp=1, seed=k)
+    M, usable = np.array(it.state.past.kept.M), np.array(it.state.past.usable)
+    new = (M[usable] <= 1).mean()
+    print(f"{100 * new:.2f} % of the pixels know nothing")
+    assert new < 0.01
+
+
 @pytest.mark.slow
 def test_biased_combination_is_darker():
     scene = many_lights()

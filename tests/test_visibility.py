@@ -8,7 +8,7 @@ from expectation import renders
 from light_scenes import glow
 from test_light_samplers import SAMPLERS, path_with
 
-from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining
+from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining, surface_point
 from mi_neural.lights.clusters import make_groups
 from mi_neural.lights.table import LightTable
 
@@ -124,6 +124,45 @@ def test_equal_seeds_give_equal_weights_and_others_do_not():
     assert rms[0] < 0.1 * rms[1]
 
 
+def test_steps_taken_together_are_those_taken_one_by_one():
+    """The points are found for eight steps in one go; the step after them is alone again."""
+    scene = wall_scene()
+    table = LightTable(scene)
+    groups = make_groups(table, 32)
+    seen = []
+    for calls in ((8, 1), (1,) * 9):
+        cache = VisibilityCache(VisibilityTraining(n_points=256), seed=3)
+        points, step = [], cache._step
+        cache._step = lambda field, x, v, *a, points=points, step=step: (
+            points.append(np.vstack([np.array(x), np.array(v).reshape(groups.n_groups, -1)])), step(field, x, v, *a)
+        )[1]  # fmt: skip
+        for n in calls:
+            cache.train(scene, scene.sensors()[0], table, groups, n)
+        seen.append((np.array(points), {k: np.array(v) for k, v in cache.field.weights.parameters().items()}))
+    (points, weights), (known, known_weights) = seen
+    np.testing.assert_array_equal(points, known)
+    assert len(points) == 9 and not np.array_equal(points[0], points[1])
+    for k, v in known_weights.items():  # sums of gradients have no fixed order
+        np.testing.assert_allclose(weights[k], v, atol=2e-3, err_msg=k)
+
+
+def test_surface_points_lie_on_the_surface_on_the_side_that_is_seen():
+    scene = wall_scene()
+    rng = np.random.default_rng(0)
+    o = rng.uniform([-2, 0.5, -2], [2, 4, 2], (4096, 3))
+    d = rng.normal(size=(4096, 3))
+    ray = mi.Ray3f(mi.Point3f(o.T), dr.normalize(mi.Vector3f(d.T)))
+    si = scene.ray_intersect(ray)
+    p, n, valid = surface_point(scene, ray, mi.Bool(True))
+    found, known = np.array(valid), np.array(si.is_valid())
+    np.testing.assert_array_equal(found, known)
+    normal = np.array(dr.mulsign(mi.Vector3f(si.n), -dr.dot(si.n, ray.d))).T[known]
+    cos = (np.array(n).T[known] * normal).sum(axis=1)
+    distance = np.linalg.norm(np.array(p).T[known] - np.array(si.p).T[known], axis=1)
+    print(f"normals right at {(cos > 0.99).mean():.3f} of the points, off by at most {distance.max():.1e}")
+    assert (cos > 0.99).mean() > 0.97 and cos.min() > 0 - 1e-3 and distance.max() < 0.01
+
+
 def test_number_of_recordings_is_constant_over_thirty_images():
     scene = wall_scene()
     integrator = mi.load_dict({
@@ -133,7 +172,7 @@ def test_number_of_recordings_is_constant_over_thirty_images():
     visibility = integrator.light_sampler.cache
 
     def recordings():
-        return [integrator.cache._frame.n_recordings, visibility._frame.n_recordings,
+        return [integrator.cache._frame.n_recordings, visibility._step.n_recordings,
                 *(p.n_recordings for p in integrator.state.passes.values())]  # fmt: skip
 
     for k in range(5):

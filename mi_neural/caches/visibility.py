@@ -14,11 +14,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.freezing import can_freeze, undisturbed
+from ..transport.freezing import undisturbed
 from ..transport.samples import PathSampler
 from . import encoding
 from .field import FieldShape, Weights, attach_adam, descend, own_copy
 from .schedule import Ramp
+
+#: Steps whose points are found in one go, where there are so many to do.
+BATCH = 8
+#: To find a normal, rays start so far beside, as a share of their length; and the steepest surface, as a tangent.
+BESIDE, STEEPEST = 1e-3, 30.0
 
 
 @dataclass(frozen=True)
@@ -86,36 +91,64 @@ def _sigmoid(v):
     return dr.rcp(1 + dr.exp(-v))
 
 
-def training_points(scene, sensor, field: VisibilityField, n: int, seed):
-    """`n` points: a quarter uniform in the field's box, the others on surfaces, at the first, second or third vertex
-    of paths that start at the camera and bounce diffusely.
+def training_points(scene, sensor, field: VisibilityField, lane, seed):
+    """One point for each entry of `lane`: a quarter uniform in the field's box, the others on surfaces, at the first,
+    second or third vertex of paths that start at the camera and bounce diffusely.
 
     A path that leaves the scene stays at the vertex before; one that never met a surface gives a point in the box.
     """
-    lane = dr.arange(mi.UInt32, n)
-    sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
+    sampler = _numbers(lane, seed, index=lane, scramble=seed)
     in_box = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / field.box_inv_extent + field.box_min
     ray, _ = sensor.sample_ray(sensor.shutter_open(), sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d())
     n_bounces = lane % 4  # 0: in the box
     on_surface = n_bounces > 0
 
     def bounce(k, ray, x, found, active, sampler):
-        si = scene.ray_intersect(ray, active)
-        active &= si.is_valid()
+        p, n, active = surface_point(scene, ray, active)
         found |= active
-        side = mi.Vector3f(0, 0, dr.sign(si.wi.z))
-        x = dr.select(active, si.spawn_ray(si.to_world(side)).o, x)  # off the surface, to the side that was seen
-        wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
-        wo.z = dr.mulsign(wo.z, si.wi.z)
-        return k + 1, si.spawn_ray(si.to_world(wo)), x, found, active & (k + 1 < n_bounces), sampler
+        x = dr.select(active, p, x)
+        wo = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+        return k + 1, mi.Ray3f(x, wo), x, found, active & (k + 1 < n_bounces), sampler
 
     _, _, x, found, _, _ = dr.while_loop(
-        (mi.UInt32(0), mi.Ray3f(ray), mi.Point3f(in_box), mi.Bool(False), mi.Bool(on_surface), sampler),
+        (mi.UInt32(0), mi.Ray3f(ray.o, ray.d), mi.Point3f(in_box), mi.Bool(False), mi.Bool(on_surface), sampler),
         lambda k, ray, x, found, active, sampler: active,
         bounce,
         label="visibility points",
     )
     return dr.select(found, x, in_box)
+
+
+def _numbers(lane, seed, index=0, scramble=0) -> PathSampler:
+    """A sampler whose numbers depend on `lane` and `seed` alone, not on where in the arrays they stand: `PCG32` adds
+    that to its seeds."""
+    state, sequence = mi.sample_tea_32(lane, seed, 6)
+    before = mi.UInt64(dr.arange(mi.UInt32, dr.width(lane)) - lane)
+    pcg = mi.PCG32(dr.width(lane), mi.UInt64(state) - before, mi.UInt64(sequence) - before)
+    return PathSampler(pcg, mi.UInt32(index), mi.UInt32(scramble))
+
+
+def surface_point(scene, ray, active):
+    """What a ray meets: (point just off the surface, normal on the side that is seen, whether there is one).
+
+    No shape is asked, so that nothing is traced or handed over for each shape of the scene: the normal is that of the
+    plane through what two rays beside this one meet, or points back along it where those meet nothing near.
+    """
+    t = scene.ray_intersect_preliminary(ray, active=active).t
+    active = active & dr.isfinite(t)
+    t = dr.select(active, t, 1)
+    s1, s2 = mi.coordinate_system(ray.d)
+    n = -ray.d
+    step = BESIDE * t
+    for s in (s1, s2):
+        beside = mi.Ray3f(ray)
+        beside.o = ray.o + step * s
+        slope = (scene.ray_intersect_preliminary(beside, active=active).t - t) / step
+        n += dr.select(dr.abs(slope) < STEEPEST, slope, 0) * s
+    n = dr.normalize(n)
+    p = ray.o + t * ray.d
+    away = (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
+    return p + away * n, n, active
 
 
 class VisibilityCache:
@@ -127,8 +160,7 @@ class VisibilityCache:
     def __init__(self, training: VisibilityTraining | None = None, shape: FieldShape | None = None, seed: int = 0):
         self.training, self.seed = training or VisibilityTraining(), seed
         self.shape = shape
-        self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
-        self._sensor_freezes: dict[int, bool] = {}
+        self._step = dr.freeze(self._step_plain, auto_opaque=False)
         self.reset()
 
     def reset(self) -> None:
@@ -145,12 +177,11 @@ class VisibilityCache:
             lane = dr.arange(mi.UInt32, n)
             sampler = PathSampler.make(lane, mi.UInt32(self.seed), index=lane, scramble=mi.UInt32(self.seed))
             ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, sampler.stratified_2d(0), sampler.next_2d())
-            si = scene.ray_intersect(ray)
-            wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
-            wo.z = dr.mulsign(wo.z, si.wi.z)
-            si_next = scene.ray_intersect(si.spawn_ray(si.to_world(wo)), si.is_valid())
-            valid = [np.array(s.is_valid() & mi.Bool(True)) * np.ones(n, bool) for s in (si, si_next)]
-            points = np.concatenate([np.array(s.p).T[v] for s, v in zip((si, si_next), valid, strict=True)])
+            p, normal, valid = surface_point(scene, mi.Ray3f(ray.o, ray.d), mi.Bool(True))
+            wo = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+            p_next, _, valid_next = surface_point(scene, mi.Ray3f(p, wo), valid)
+            dr.eval(p, valid, p_next, valid_next)
+            points = np.concatenate([np.array(q).T[np.array(v)] for q, v in ((p, valid), (p_next, valid_next))])
         low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
         shape = self.shape or FieldShape(
             n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
@@ -158,37 +189,66 @@ class VisibilityCache:
         )  # fmt: skip
         self.field = VisibilityField(low, high, shape, self.seed)
 
-    def _frame_plain(self, scene, sensor, field, table, groups, seed, learning_rate, decay):
+    def _records(self, scene, sensor, table, groups, seeds):
+        """Training points of some steps, one for each of `seeds`, and what they see: (points, step by step; 1 or 0 by
+        step, light or cluster, and point).
+
+        Not frozen: it is traced in 10 ms, whatever the scene, of which Dr.Jit would look at all parts to replay it (40
+        us each).
+        """
         n, n_out = self.training.n_points, groups.n_groups
         with dr.suspend_grad():
-            x = training_points(scene, sensor, field, n, seed)
+            lane = dr.arange(mi.UInt32, n * dr.width(seeds))
+            x = training_points(scene, sensor, self.field, lane % n, dr.gather(mi.UInt32, seeds, lane // n))
             dr.eval(x)
-            lane = dr.arange(mi.UInt32, n * n_out)
+            lane = dr.arange(mi.UInt32, n * n_out * dr.width(seeds))
+            step, lane = lane // (n * n_out), lane % (n * n_out)
             point, group = lane % n, lane // n
-            sampler = PathSampler.make(lane, seed + 1)
+            sampler = _numbers(lane, dr.gather(mi.UInt32, seeds, step) + 1)
             light = groups.sample_light(group, sampler.next_1d(), mi.Bool(True))[0]
-            p = dr.gather(mi.Point3f, x, point)
+            p = dr.gather(mi.Point3f, x, step * n + point)
             ray, some = table.shadow_ray(scene, p, light, sampler.next_2d(), mi.Bool(True))
             visible = dr.select(scene.ray_test(ray, some), mi.Float(0), 1)
             dr.eval(visible)
-        return field.step(x, mi.TensorXf(visible, shape=(n_out, n)), learning_rate, decay)
+        return x, visible
+
+    def _step_plain(self, field, x, visible, learning_rate, decay):
+        visible = mi.TensorXf(visible, shape=(field.shape.n_outputs, dr.width(x)))
+        return field.step(x, visible, learning_rate, decay)
 
     def train(self, scene, sensor, table, groups, steps: int = 1) -> None:
         """So many steps, each on fresh points."""
         if self.field is None:
             self.start(scene, sensor, groups.n_groups)
-        if id(sensor) not in self._sensor_freezes:
-            self._sensor_freezes[id(sensor)] = can_freeze(sensor)
-        frame = self._frame if self._sensor_freezes[id(sensor)] else self._frame_plain
         t0 = time.perf_counter()
-        for _ in range(steps):
-            seed = int(np.random.SeedSequence((self.seed, 0x7151B1E, self.steps)).generate_state(1)[0])
+        done = 0
+        while done < steps:
+            n_steps = BATCH if steps - done >= BATCH else 1
+            numbers = range(self.steps, self.steps + n_steps)
+            seeds = [int(np.random.SeedSequence((self.seed, 0x7151B1E, k)).generate_state(1)[0]) for k in numbers]
+            seeds = mi.UInt32(seeds)
+            dr.make_opaque(seeds)
             with undisturbed():
-                loss = frame(scene, sensor, self.field, table, groups, dr.opaque(mi.UInt32, seed),
-                             dr.opaque(mi.Float, self.training.rate(self.steps)),
-                             dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
-            self.steps += 1
+                points = self._records(scene, sensor, table, groups, seeds)
+                for k in range(n_steps):
+                    loss = self._step(self.field, *_part(points, k, n_steps),
+                                      dr.opaque(mi.Float, self.training.rate(self.steps)),
+                                      dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
+                    self.steps += 1
+            done += n_steps
         if steps:
             self.statistics["visibility_loss"] = loss[0]
         self.statistics["visibility_steps"] += steps
         self.statistics["seconds_visibility"] += time.perf_counter() - t0
+
+
+def _part(arrays, k: int, n: int) -> list:
+    """Part `k` of `n` of each of `arrays`, in memory of its own."""
+    if n == 1:
+        return list(arrays)
+    parts = []
+    for array in arrays:
+        size = dr.width(array) // n
+        parts.append(dr.gather(type(array), array, dr.arange(mi.UInt32, size) + dr.opaque(mi.UInt32, k * size)))
+    dr.eval(parts)
+    return parts

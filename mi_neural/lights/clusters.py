@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .table import DIRECTION, ENVIRONMENT, LOCAL, LightTable
+from .table import DIRECTION, ENVIRONMENT, LOCAL, LightTable, own
 
 METHODS = ("auto", "kmeans", "emitter")
 
@@ -17,12 +17,13 @@ class Groups:
     As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in a Python list
     `kind`, and in arrays. `cell`: which groups are parts of the environment. `start`, `count`: its range in `member`,
     the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity),
-    `cumulative` its running sum over `member`; `group_of` leads from light to group.
+    `cumulative` its running sum over `member`; `group_of` leads from light to group. `facts`: see the light table.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
         "center": object, "radius": object, "axis": object, "cone": object, "intensity": object, "start": object,
         "count": object, "member": object, "within": object, "cumulative": object, "group_of": object,
+        "facts": object,
     }  # fmt: skip
 
     def __init__(self, table: LightTable, label: np.ndarray, intensity: np.ndarray | None = None):
@@ -82,10 +83,10 @@ class Groups:
         np.maximum.at(widest, label, angle)
         cone = np.where(far, np.cos(np.minimum(widest + np.where(one, 0, 1e-4), np.pi)), cone)
         cone[[k == ENVIRONMENT for k in self.kind]] = -1
-        vec = lambda v: mi.Vector3f(np.ascontiguousarray(v.T, np.float32))  # noqa: E731
+        vec = lambda v: own(mi.Vector3f(np.ascontiguousarray(v.T, np.float32)))  # noqa: E731
         big = np.finfo(np.float32).max
-        flt = lambda v: mi.Float(np.ascontiguousarray(np.minimum(v, big), np.float32))  # noqa: E731
-        num = lambda v: mi.UInt32(np.ascontiguousarray(v, np.uint32))  # noqa: E731
+        flt = lambda v: own(mi.Float(np.ascontiguousarray(np.minimum(v, big), np.float32)))  # noqa: E731
+        num = lambda v: own(mi.UInt32(np.ascontiguousarray(v, np.uint32)))  # noqa: E731
         self.center, self.radius, self.axis, self.cone, self.intensity = (
             vec(center),
             flt(radius),
@@ -96,6 +97,7 @@ class Groups:
         self.start, self.count, self.member = num(start), num(count), num(order)
         self.within, self.cumulative, self.group_of = flt(within), flt(cumulative), num(label)
         self.search_steps = int(count.max(initial=1) - 1).bit_length()
+        self.facts = (self.n_groups, self.single, self.search_steps, *self.kind, *self.cell)
         dr.eval(self)
 
     def sample_light(self, group, u, active):

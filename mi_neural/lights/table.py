@@ -44,15 +44,15 @@ class LightTable:
                      DIRECTION: `cone` is the cosine of the largest angle of its directions to `center`
     intensity        LOCAL: radiance times area, or radiant intensity; else irradiance of a surface that faces the light
 
-    `n_lights` etc. are Python numbers; `first`, `stride` lead from an emitter's registry number and a primitive to an
-    entry.
+    `n_lights` etc. are Python numbers; `facts` are all of them, for which a frozen function is recorded anew. `first`,
+    `stride` lead from an emitter's registry number and a primitive to an entry.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
         "emitter": object, "flat": object, "corner": object, "edge1": object, "edge2": object, "normal": object,
         "folded": object, "prim": object, "area": object, "radiance": object, "plain": object, "kind": object,
         "center": object, "radius": object, "axis": object, "cone": object, "intensity": object,
-        "first": object, "stride": object,
+        "first": object, "stride": object, "facts": object,
     }  # fmt: skip
 
     def __init__(self, scene, seed: int = 0, texels: bool = False):
@@ -80,7 +80,7 @@ class LightTable:
         first, stride = np.zeros(ids.max(initial=0) + 1, np.uint32), np.zeros(ids.max(initial=0) + 1, np.uint32)
         first[ids[columns["emitter"][::-1]]] = np.arange(self.n_lights, dtype=np.uint32)[::-1]
         stride[ids] = (np.bincount(columns["emitter"], minlength=n_emitters) > 1).astype(np.uint32)
-        self.first, self.stride = mi.UInt32(first), mi.UInt32(stride)
+        self.first, self.stride = own(mi.UInt32(first)), own(mi.UInt32(stride))
         extent = np.array(scene.bbox().extents(), np.float64).ravel()
         self.cross_section = float(np.pi / 4 * (extent**2).sum()) if np.isfinite(extent).all() else 1.0
         dr.eval(self)
@@ -96,12 +96,14 @@ class LightTable:
             else:
                 kinds = {"u": mi.UInt32, "b": mi.Bool, "f": mi.Float}
                 values = kinds[values.dtype.kind](values)
-            setattr(self, name, values)
+            setattr(self, name, own(values))
         self.any_flat, self.all_flat = bool(columns["flat"].any()), bool(columns["flat"].all())
         n_texels = self.sky.size**2 if self.sky is not None else 0
         self.any_other = int((~columns["flat"]).sum()) > n_texels  # sampled by their emitters
         self.all_plain = bool((columns["plain"] | ~columns["flat"]).all())
         self.kinds = sorted(set(columns["kind"].tolist()))
+        known = self.any_flat, self.all_flat, self.any_other, self.all_plain
+        self.facts = (self.n_lights, n_texels, *known, *self.kinds)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -214,6 +216,14 @@ class LightTable:
         ray = mi.Ray3f(p, to / dr.maximum(distance, 1e-30))
         ray.maxt = distance * (1 - SHADOW_EPSILON)
         return ray, distance > 0
+
+
+def own(values):
+    """A copy in memory of Dr.Jit's own. NumPy's is aligned by chance, and for each pattern of what is aligned in its
+    arguments a frozen function is recorded anew."""
+    scalar = type(values) if dr.depth_v(values) == 1 else dr.value_t(type(values))
+    dr.make_opaque(values)  # no literals, which would be compiled
+    return values ^ dr.opaque(scalar, False) if dr.is_mask_v(values) else values + dr.opaque(scalar, 0)
 
 
 def importance(light, x, n, two_sided):
