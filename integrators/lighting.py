@@ -45,6 +45,9 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
     takes longer than a sample a pixel.
     """
 
+    #: Whether images may be rendered by frozen functions.
+    freezes = True
+
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
@@ -59,7 +62,7 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         self.entered = True
         try:
             self.prepare_lights(scene, sensor)
-            frozen = None if _differentiates() else self._frozen_image(scene, sensor, spp)
+            frozen = None if not self.freezes or _differentiates() else self._frozen_image(scene, sensor, spp)
             if frozen is None:
                 return super().render(scene, sensor, seed, spp, develop, evaluate)
             return self._replay(frozen, scene, sensor, seed, spp, develop, evaluate)

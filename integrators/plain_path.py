@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, LightSamplingIntegrator
+from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.transport import vertex
 
 
@@ -34,8 +35,14 @@ class PlainPathIntegrator(LightSamplingIntegrator):
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
     """
-        + LIGHT_SAMPLER_KEY
+        + LIGHT_SAMPLER_KEY.rstrip()
         + r"""
+     * - neural_depth
+       - |int|
+       - From this vertex on (0: the first surface) direct light is what the nested ``nvc_lights`` predicts, which must
+         know lights one by one: no shadow ray, no noise, but a bias, as in ``nvc_direct`` with ``mode=neural``. -1:
+         nowhere. (Default: -1)
+
     *Works with* all surfaces and emitters of Mitsuba. *Leaves out* participating media (use ``volpath``), polarization.
 
     .. tabs::
@@ -56,8 +63,45 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         self.hide = props.get("hide_emitters", False)
         if self.max_depth < -1:
             raise ValueError(f"plain_path: max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
+        self.neural_depth = props.get("neural_depth", -1)
+        self.freezes = self.neural_depth < 0
+        self.unshadowed: UnshadowedLights | None = None
+        if self.neural_depth < -1:
+            raise ValueError(f"plain_path: neural_depth is {self.neural_depth}; give -1 (nowhere), 0, or more")
+        if self.neural_depth >= 0 and not getattr(self.light_sampler, "visibility", False):
+            raise ValueError("plain_path: neural_depth needs an nvc_lights with visibility=true as light_sampler")
         if self.rr_depth < 1:
             raise ValueError(f"plain_path: rr_depth is {self.rr_depth}; it must be at least 1")
+
+    def prepare_lights(self, scene, sensor, train: bool = True) -> None:
+        super().prepare_lights(scene, sensor, train)
+        if self.neural_depth < 0 or self.lights is None:  # a single light is traced as ever
+            self.unshadowed = None
+            return
+        lights = self.lights
+        if not lights.groups.single:
+            raise ValueError(
+                f"plain_path: neural_depth must know each light by itself, and there are {lights.table.n_lights} for "
+                f"{lights.groups.n_groups} outputs; raise outputs of the light_sampler (up to 256), with "
+                "environment_cells=0"
+            )
+        with dr.suspend_grad():
+            if self.unshadowed is None or self.unshadowed.table is not lights.table:
+                self.unshadowed = UnshadowedLights(scene, lights.table)
+            else:
+                self.unshadowed.refresh()
+
+    def direct(self, scene, sampler, si, bsdf, si_next, pdf_bsdf, delta, depth, active, followed):
+        """Both halves of direct light, as ``vertex.emitted``; deep down as predicted, and what mirrors show."""
+        predicted = active & (depth >= self.neural_depth) if self.unshadowed is not None else mi.Bool(False)
+        L, Le = vertex.emitted(
+            scene, self.lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active & ~predicted, si_next,
+            pdf_bsdf, delta, followed & (~predicted | delta),
+        )  # fmt: skip
+        if self.unshadowed is not None:
+            predicted &= vertex.has_smooth(bsdf)
+            L += self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), predicted)
+        return L, Le
 
     @dr.syntax
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -94,10 +138,7 @@ class PlainPathIntegrator(LightSamplingIntegrator):
 
             # Direct light: by next-event estimation, and what that direction met
             followed = active & (dr.max(weight) > 0)
-            L_nee, Le = vertex.emitted(
-                scene, self.lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf,
-                delta, followed,
-            )  # fmt: skip
+            L_nee, Le = self.direct(scene, sampler, si, bsdf, si_next, bs.pdf, delta, depth, active, followed)
             L += β * (L_nee + weight * Le)
 
             β *= weight
