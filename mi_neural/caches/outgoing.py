@@ -9,11 +9,9 @@ renderers of your own: :class:`~mi_neural.caches.radiance_cache.RadianceCache`.
 
 from __future__ import annotations
 
-import json
 import math
-import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -22,9 +20,11 @@ import numpy as np
 from ..transport.freezing import undisturbed
 from ..transport.samples import PathSampler
 from ..transport.suffixes import CONTENTS, Suffixes, packed, scene_is_glossy, trace_suffixes
-from . import encoding, loss
-from .field import CacheFileError, FieldShape, Weights, attach_adam, descend, own_copy
+from . import encoding, files, loss
+from .blend import OutgoingBlend
+from .field import FieldShape, Weights, attach_adam, descend, own_copy
 from .incident import SCALE_TRIM, IncidentCache, Training
+from .reliability import Reliability
 
 #: Changes when a file written before cannot be read any more.
 FILE_VERSION = 1
@@ -61,6 +61,13 @@ class OutgoingShape(FieldShape):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 0..7")
         if self.n_outputs != 3:
             raise ValueError(f"n_outputs is {self.n_outputs}; outgoing radiance has 3, its colours")
+
+    @classmethod
+    def like(cls, sizes: FieldShape) -> OutgoingShape:
+        """The sizes of the grid and the network of another field."""
+        return cls(
+            n_levels=sizes.n_levels, hashmap_size=sizes.hashmap_size, width=sizes.width, n_hidden=sizes.n_hidden
+        )
 
     @property
     def n_inputs(self) -> int:
@@ -198,9 +205,14 @@ class OutgoingField:
 
     def query(self, x, n, w, albedo, roughness, averaged: bool = True):
         """Radiance that leaves the surface towards `w`; never negative, and 0 where an input is not `usable`."""
+        return self.answer(self.averaged if averaged else self.current, x, n, w, albedo, roughness)
+
+    def answer(self, weights: Weights, x, n, w, albedo, roughness):
+        """:meth:`query` by any weights of this field's shape."""
         usable = self.usable(x, n, w, albedo, roughness)
         inputs = _sanitize(usable, x, n, w, albedo, roughness)
-        value = dr.maximum(self.raw(*inputs, averaged), 0) * self.scale * reflectance(inputs[3])
+        value = dr.maximum(mi.Color3f(*weights(self._encode(weights, *inputs))) + 1, 0)
+        value = value * self.scale * reflectance(inputs[3])
         return dr.select(usable & dr.all(dr.isfinite(value)), value, 0)
 
     # -------------------------------------------------------------------------------------------------------------
@@ -214,7 +226,10 @@ class OutgoingField:
         out = self.current.mlp(mi.TensorXf(dr.concat(inputs), shape=(self.shape.n_inputs, width)))
         return mi.Color3f(*(out[i, :].array for i in range(3))) + 1
 
-    def learn(self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON):
+    def learn(
+        self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,
+        watch: Callable | None = None,
+    ):  # fmt: skip
         """One step of Adam on records of radiance `target`, then the averaged copy. May be frozen.
 
         The loss is ``mean |p - y|² / (luminance(p)² + ε)`` with p and y over albedo and `scale`. The average is
@@ -225,7 +240,8 @@ class OutgoingField:
         targets are not finite are left out; with no record left, or a loss that is not finite, nothing changes
         (but Adam's own count of steps).
 
-        `learning_rate` and `smoothing` are 1-wide Dr.Jit floats. Returns (loss, mean target, mean |prediction|, number
+        `learning_rate` and `smoothing` are 1-wide Dr.Jit floats. ``watch(y, p, usable)``, if given, is called before
+        the step with targets and predictions, both over albedo. Returns (loss, mean target, mean |prediction|, number
         of records left out), 1-wide, the first three over `scale`; the loss is NaN where there was nothing to learn.
         """
         with dr.suspend_grad():
@@ -245,6 +261,9 @@ class OutgoingField:
             dr.eval(usable, n_bad, x, n, w, albedo, roughness, y, share, able, scale, mean_target)
 
         p = self.predict(x, n, w, albedo, roughness)
+        if watch is not None:
+            with dr.suspend_grad():
+                watch(y * scale, dr.maximum(dr.detach(p), 0) * scale, usable)
         error = dr.sum(dr.select(usable, loss.relative_l2(p, y, epsilon), 0)) * share
         error = dr.select(able, error, math.nan)
         mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(dr.detach(p))), 0)) * share
@@ -300,59 +319,49 @@ class OutgoingField:
             weights.pack()
         self._attach_optimizer()
 
-    def save(self, path, **facts) -> None:
-        """Write weights, shape, box, scale and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
-        path = Path(path)
-        header = {
+    def n_parameters(self) -> int:
+        """Number of trained numbers."""
+        return sum(int(np.prod(v.shape)) for v in self.averaged.parameters().values())
+
+    def state(self) -> tuple:
+        """All that training changes, for :meth:`set_state`; the optimiser's moments are not in it."""
+        numbers = mi.Float(self.scale), mi.Float(self.eta), mi.Float(self.density)
+        return self.snapshot(), *numbers, self.places.copy(), self.steps
+
+    def set_state(self, state: tuple) -> None:
+        """Go back to what :meth:`state` gave."""
+        arrays, self.scale, self.eta, self.density, self.places, self.steps = state
+        self.restore(arrays)
+
+    def header(self) -> dict:
+        """What a file says of the field beside its weights, in JSON values."""
+        return {
             "kind": "outgoing", "version": FILE_VERSION, "shape": asdict(self.shape), "box": self.box,
             "given_scale": self.given_scale, "scale": float(self.scale[0]), "eta": float(self.eta[0]),
-            "seed": self.seed, "steps": self.steps, **facts,
+            "seed": self.seed, "steps": self.steps,
         }  # fmt: skip
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            with open(temporary, "wb") as file:
-                np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **self.snapshot())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+
+    @staticmethod
+    def of_parts(header: dict, arrays: dict[str, np.ndarray]) -> OutgoingField:
+        """The field of a :meth:`header` and a :meth:`snapshot`. Raises what impossible ones lead to."""
+        shape = OutgoingShape(**header["shape"])
+        field = OutgoingField(*header["box"], shape, scale=header["given_scale"], seed=header["seed"])
+        files.check_arrays(arrays, field.snapshot())
+        scale, eta, steps = header["scale"], header["eta"], header["steps"]
+        if not (isinstance(steps, int) and steps >= 0 and 0 <= scale < math.inf and 0 <= eta <= 1):
+            raise ValueError(f"it says {steps} steps, a scale of {scale} and an average filled to {eta}")
+        field.restore(arrays)
+        field.scale, field.eta, field.steps = dr.opaque(mi.Float, scale), dr.opaque(mi.Float, eta), steps
+        return field
+
+    def save(self, path, **facts) -> None:
+        """Write weights, shape, box, scale and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
+        files.write(path, {**self.header(), **facts}, self.snapshot())
 
     @staticmethod
     def load(path) -> tuple[OutgoingField, dict]:
-        """The field of a file, and its header. No code in the file is run.
-
-        Raises `CacheFileError` for a file that is missing, cut short, not of an outgoing field, or of another version.
-        """
-        path = Path(path)
-        try:
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as entries:
-                arrays = {k: entries[k] for k in entries.files}
-            header = json.loads(bytes(arrays.pop("header")).decode())
-            version, kind = header["version"], header.get("kind")
-        except FileNotFoundError:
-            raise CacheFileError(f"there is no cache file '{path}'") from None
-        except Exception as e:
-            raise CacheFileError(f"'{path}' is not a cache file of mi_neural, or is damaged ({e})") from None
-        if kind != "outgoing":
-            raise CacheFileError(f"'{path}' holds no outgoing radiance; train an outgoing cache and save it")
-        if version != FILE_VERSION:
-            raise CacheFileError(
-                f"'{path}' has cache format {version}, this version reads {FILE_VERSION}; train and save it again"
-            )
-        try:
-            shape = OutgoingShape(**header["shape"])
-            field = OutgoingField(*header["box"], shape, scale=header["given_scale"], seed=header["seed"])
-            if {k: v.shape for k, v in arrays.items()} != {k: v.shape for k, v in field.snapshot().items()}:
-                raise ValueError("its arrays do not have the sizes that its header says")
-            if not all(np.isfinite(v).all() for v in arrays.values()):
-                raise ValueError("it holds weights that are not finite")
-            scale, eta, steps = header["scale"], header["eta"], header["steps"]
-            if not (isinstance(steps, int) and steps >= 0 and 0 <= scale < math.inf and 0 <= eta <= 1):
-                raise ValueError(f"it says {steps} steps, a scale of {scale} and an average filled to {eta}")
-            field.restore(arrays)
-            field.scale, field.eta, field.steps = dr.opaque(mi.Float, scale), dr.opaque(mi.Float, eta), steps
-        except Exception as e:
-            raise CacheFileError(f"'{path}' is not a cache file of mi_neural, or is damaged ({e})") from None
-        return field, header
+        """The field of a file, and its header; errors as of :func:`.files.read`."""
+        return files.read(path, FILE_VERSION, "outgoing", OutgoingField.of_parts)
 
 
 def _sanitize(usable, x, n, w, albedo, roughness) -> tuple:
@@ -403,11 +412,20 @@ class OutgoingTraining(Training):
         if not self.threshold >= 0:
             raise ValueError(f"threshold is {self.threshold}; it must be 0 or more")
 
-    def paths(self, probe: bool = False) -> Suffixes:
+    @classmethod
+    def like(cls, shared: Training, **chosen) -> OutgoingTraining:
+        """The constants that incident and outgoing training have in common, and `chosen` others."""
+        return cls(
+            n_paths=shared.n_paths, n_vertices=shared.n_vertices, learning_rate=shared.learning_rate,
+            ema_decay=shared.ema_decay, last_rate=shared.last_rate, **chosen,
+        )  # fmt: skip
+
+    def paths(self, probe: bool = False, twins: bool = False) -> Suffixes:
         """How training paths run; those of the `probe` end in nothing, for want of a cache."""
         return Suffixes(
             self.n_paths, self.n_vertices, "full" if probe else self.suffix, self.threshold,
             0 if probe else round(self.n_paths * self.unbounded_share), self.world_share, self.roughening, self.content,
+            twins,
         )  # fmt: skip
 
     @property
@@ -417,21 +435,35 @@ class OutgoingTraining(Training):
         return min(most, self.n_records or (3 * self.n_paths if self.suffix == "spread" else most))
 
 
-def trace_outgoing(scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool):
-    """Fresh training records, targets ending in the averaged cache (in nothing without a field)."""
+def training_paths(
+    scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool,
+    twins: bool = False, first: Callable | None = None,
+):  # fmt: skip
+    """Fresh training paths, targets ending in the averaged cache (in nothing without a field); see
+    :func:`~mi_neural.transport.suffixes.trace_suffixes`."""
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
-    plan = training.paths(probe=field is None)
+    plan = training.paths(field is None, twins)
     if field is None:
         return trace_suffixes(scene, sensor, sampler, plan, None, lights, None, glossy)
     # Close before the place, where hardly anything can lie between
     places = field.places.position, field.places.view, 1e-3 * dr.norm(1 / field.box_inv_extent)
-    records, n_bad = trace_suffixes(
-        scene, sensor, sampler, plan, lambda surface: field.query(*surface.inputs()), lights, places, glossy
+    return trace_suffixes(
+        scene, sensor, sampler, plan, lambda surface: field.query(*surface.inputs()), lights, places, glossy, first
     )
-    if training.capacity < dr.width(records.valid):
+
+
+def fitted(records, training: OutgoingTraining):
+    """The valid ones of evaluated `records` in as many places as a step has for them."""
+    return packed(records, training.capacity) if training.capacity < dr.width(records.valid) else records
+
+
+def trace_outgoing(scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool):
+    """Fresh training records, and how many were left out because their targets were not finite."""
+    records, n_bad, _, _ = training_paths(scene, sensor, field, training, seed, lights, glossy)
+    if field is not None:
         dr.eval(records, n_bad)
-        records = packed(records, training.capacity)
+        records = fitted(records, training)
     return records, n_bad
 
 
@@ -448,28 +480,54 @@ def _reaching(low, high, scene_low, scene_high) -> tuple:
 class OutgoingCache(IncidentCache):
     """A field of outgoing radiance together with its training. In all but what it learns an `IncidentCache`."""
 
-    def __init__(self, training: OutgoingTraining | None = None, shape: OutgoingShape | None = None, seed: int = 0):
-        super().__init__(training or OutgoingTraining(), shape or OutgoingShape(), seed)
+    FIELD, BLEND = OutgoingField, OutgoingBlend
+
+    def __init__(
+        self, training: OutgoingTraining | None = None, shape: OutgoingShape | None = None, seed: int = 0, *,
+        blend: str = "ema", reliability: Reliability | None = None,
+    ):  # fmt: skip
+        super().__init__(
+            training or OutgoingTraining(), shape or OutgoingShape(), seed, blend=blend, reliability=reliability
+        )
 
     def _probe_plain(self, scene, sensor, lights, seed):
         records, _ = trace_outgoing(scene, sensor, None, self.training, seed, lights, False)
         target = records.target / reflectance(records.surface.albedo)
         return records.surface.position, loss.luminance(target), records.valid
 
-    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, asked, seed, learning_rate, decay):
+        blend = asked if isinstance(asked, OutgoingBlend) else None
+        field = blend.field if blend else asked
         with dr.suspend_grad():
             records, n_bad = trace_outgoing(scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene))
             n_valid = dr.count(records.valid)
             dr.eval(records, n_bad, n_valid)
-            field.count(records.surface.position, records.valid, decay)
-            if self.training.world_share > 0:
-                sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x9E3779B9)
-                field.places.remember(records.surface.position, records.surface.view, records.valid, sampler)
+            self.note(field, records, seed, decay)
+
+        def watch(y, current, usable):
+            surface = records.surface
+            averaged = field.query(*surface.inputs()) / reflectance(surface.albedo)
+            dr.eval(averaged)
+            blend.observe_surfaces(surface.position, surface.normal, usable, y, current, averaged)
+
         value, mean_target, mean_prediction, more = field.learn(
-            *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon
-        )
+            *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon,
+            watch if blend else None,
+        )  # fmt: skip
         value = dr.select(n_valid > 0, value, 0)  # nothing to learn is no divergence
-        return value, mean_target, mean_prediction, n_valid, n_bad + more, mi.Float(0)
+        sigma = mi.Float(0)
+        if blend:
+            with dr.suspend_grad():
+                blend.refresh()
+                sigma = blend.mean_sigma()
+        return value, mean_target, mean_prediction, n_valid, n_bad + more, sigma
+
+    def note(self, field: OutgoingField, records, seed, decay) -> None:
+        """Keep where the records of a step lie."""
+        field.count(records.surface.position, records.valid, decay)
+        if self.training.world_share > 0:
+            sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x9E3779B9)
+            field.places.remember(records.surface.position, records.surface.view, records.valid, sampler)
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -488,20 +546,3 @@ class OutgoingCache(IncidentCache):
             scale = 1e-20  # no light found: the cache answers with nothing
         self.field = OutgoingField(low, high, self.shape, scale=scale, seed=self.seed)
         dr.eval(self.field)
-
-    def checkpoint(self):
-        field = self.field
-        state = None if field is None else (
-            field.snapshot(), mi.Float(field.scale), mi.Float(field.eta), mi.Float(field.density), field.places.copy()
-        )  # fmt: skip
-        return state, self.steps, self.rate_factor, list(self.history), self._good, dict(self.statistics)
-
-    def rollback(self, state) -> None:
-        if state is None:
-            super().rollback(None)
-            return
-        held, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
-        if held is not None:
-            self.field.restore(held[0])
-            self.field.scale, self.field.eta, self.field.density, self.field.places = held[1:]
-            self.field.steps, self.levels = self.steps, []
