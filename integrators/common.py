@@ -10,8 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.caches.field import CacheFileError, Field, FieldShape
+from mi_neural.caches.blend import BLENDS
+from mi_neural.caches.field import CacheFileError, FieldShape
 from mi_neural.caches.incident import IncidentCache, Training
+from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, light_sampler_of
 from mi_neural.transport.freezing import undisturbed
@@ -72,6 +74,23 @@ SHARED_KEYS = (
      * - hidden_layers
        - |int|
        - Their number. (Default: 2)
+     * - blend
+       - |string|
+       - Which weights answer. ``ema``: their average, least noise, lags behind changes. ``fast``: those being trained.
+         ``reliability``: (1 - σ) average + σ trained, σ by place from how both agree with the training records; as
+         quick as ``fast`` where light changes, as still as ``ema`` elsewhere. ``switch``: the same with σ rounded to 0
+         or 1. For scenes that change; in still ones ``ema`` is best. (Default: ema)
+     * - reliability
+       - |string|
+       - How σ is found: ``evidence`` (a test whether the trained weights are better), ``correlation``, ``concordance``,
+         ``regression``. (Default: evidence)
+     * - reliability_normals
+       - |bool|
+       - Keep statistics apart by the six main directions of the normal. (Default: false)
+     * - last_rate
+       - |float|
+       - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be
+         quick)
 """
     + LIGHT_SAMPLER_KEY.strip("\n")
     + """
@@ -155,11 +174,13 @@ class CacheIntegrator(mi.SamplingIntegrator):
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
         try:
+            blend = props.get("blend", "ema")
             training = Training(
                 n_paths=props.get("train_samples", 4096),
                 n_vertices=props.get("train_vertices", 8),
                 learning_rate=props.get("learning_rate", 1e-2),
                 ema_decay=props.get("ema_decay", 0.99),
+                last_rate=props.get("last_rate", 0.1 if blend == "ema" else 1.0),
             )
             shape = FieldShape(
                 n_levels=props.get("levels", 8),
@@ -175,7 +196,11 @@ class CacheIntegrator(mi.SamplingIntegrator):
         self.channels = names
         self.light_sampler = light_sampler_of(props)
 
-        self.cache = IncidentCache(training, shape, seed=self.seed)
+        measure, by_normal = props.get("reliability", "evidence"), props.get("reliability_normals", False)
+        self._check(blend in BLENDS, f"blend is '{blend}'; give one of: {', '.join(BLENDS)}")
+        self._check(measure in MEASURES, f"reliability is '{measure}'; give one of: {', '.join(MEASURES)}")
+        reliability = Reliability(measure=measure, split_normals=by_normal)
+        self.cache = IncidentCache(training, shape, seed=self.seed, blend=blend, reliability=reliability)
         self.state = _State()
         self.reset()
 
@@ -329,19 +354,19 @@ class CacheIntegrator(mi.SamplingIntegrator):
         s["queries"] = int(self.state.queries)
         s["images"] = self.state.images
         s.update(self.state.facts)
+        s.update(self.cache.measured())
         if self.light_sampler is not None:
             s.update(self.light_sampler.statistics())
             s["seconds_train"] += s.get("seconds_visibility", 0.0)
         if self.cache.field is not None:
-            s["parameters"] = sum(int(np.prod(v.shape)) for v in self.cache.field.averaged.parameters().values())
+            s["parameters"] = self.cache.field.n_parameters()
             s["scale"] = float(self.cache.field.scale[0])
         if math.isfinite(self.state.ns_per_query):
             s["ns_per_query"] = self.state.ns_per_query
         return s
 
-    def measure_query(self, n: int = 2**18, directions: int = 8) -> float:
-        """Nanoseconds per cache query: positions encoded once, `directions` queries each, all counted. Also kept for
-        :meth:`statistics`."""
+    def measure_query(self, n: int = 2**18) -> float:
+        """Nanoseconds per cache query, as :meth:`probe` asks it. Also kept for :meth:`statistics`."""
         field = self.cache.asked
         if field is None:
             raise RuntimeError(f"{self.plugin}: there is no cache yet; render an image or call train() first")
@@ -350,16 +375,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         def run(field, seed):
             sampler = PathSampler.make(dr.arange(mi.UInt32, n), seed)
             plain = getattr(field, "field", field)
-            low, inv = plain.box_min, plain.box_inv_extent
-            x = low + mi.Vector3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / inv
-            features = field.encode(x, mi.Normal3f(0, 0, 1))
-
-            def ask(i, total, sampler):
-                w = mi.warp.square_to_uniform_sphere(sampler.next_2d())
-                return i + 1, total + field.query(features, w), sampler
-
-            _, total, _ = dr.while_loop((mi.UInt32(0), mi.Color3f(0), sampler), lambda i, t, s: i < directions, ask)
-            return total
+            x = mi.Vector3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
+            return self.probe(field, plain.box_min + x / plain.box_inv_extent, sampler)
 
         times = []
         with dr.suspend_grad():
@@ -369,27 +386,51 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 dr.eval(run(field, mi.UInt32(k)))
                 dr.sync_thread()
                 times.append(time.perf_counter() - t0)
-        self.state.ns_per_query = float(np.median(times[2:])) / (n * directions) * 1e9
+        self.state.ns_per_query = float(np.median(times[2:])) / (n * self.PROBES) * 1e9
         return self.state.ns_per_query
+
+    #: Queries at a point of :meth:`probe`.
+    PROBES = 8
+
+    def probe(self, field, x, sampler):
+        """What :meth:`measure_query` times: a position encoded once and asked in `PROBES` directions."""
+        features = field.encode(x, mi.Normal3f(0, 0, 1))
+
+        def ask(i, total, sampler):
+            w = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+            return i + 1, total + field.query(features, w), sampler
+
+        _, total, _ = dr.while_loop((mi.UInt32(0), mi.Color3f(0), sampler), lambda i, t, s: i < self.PROBES, ask)
+        return total
 
     # -------------------------------------------------------------------------------------------------------------
     # Cache files
+
+    def file_facts(self) -> dict:
+        """What a cache file says about its integrator (JSON values)."""
+        return {"plugin": self.plugin}
+
+    def check_file(self, path, header: dict) -> None:
+        """Raise `CacheFileError` for a cache, of the right sizes, that means something else here."""
 
     def save_cache(self, path) -> None:
         """Write the trained cache to `path`, whole or not at all."""
         if self.cache.field is None:
             raise RuntimeError(f"{self.plugin}: there is no cache to save yet; render an image or call train() first")
-        self.cache.field.save(path, plugin="nirc", scene=self.state.signature, statistics=dict(self.cache.statistics))
+        self.cache.field.save(
+            path, scene=self.state.signature, statistics=dict(self.cache.statistics), **self.file_facts()
+        )
 
     def load_cache(self, path, scene=None) -> None:
         """Go on from a cache file. With `scene`, or once a scene was rendered: refuse a cache of another scene.
 
         Raises `CacheFileError` (a ``ValueError``).
         """
-        field, header = Field.load(path)
+        field, header = self.cache.FIELD.load(path)
         if field.shape != self.cache.shape:
             raise CacheFileError(f"'{path}' holds a cache of {field.shape}, this integrator has {self.cache.shape}; "
                                  "give it the same sizes")  # fmt: skip
+        self.check_file(path, header)
         if scene is not None:
             self._ready(scene, self._sensor(scene, 0), train=False)
         known = self.state.signature

@@ -1,18 +1,19 @@
 """``nirc``: paths that end in a neural incident radiance cache."""
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.caches.blend import BLENDS, Blend
-from mi_neural.caches.reliability import MEASURES, Reliability
+from mi_neural.caches.blend import sigma_channels
+from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.pair import PairCache
+from mi_neural.integrators import automatic
+from mi_neural.integrators.automatic import AUTO
 from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
 from mi_neural.transport import termination, vertex
 from mi_neural.transport.samples import PathSampler
 
-TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
+TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "auto")
 #: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
 #: the cache's directional detail does not suffice for it.
 SHARP_PDF = 3.0
@@ -28,15 +29,6 @@ class NIRCIntegrator(CacheIntegrator):
         self.termination = props.get("termination", "adaptive")
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self.gather_half = props.get("gather_half", 4.0)
-        self.cache.blend = props.get("blend", "ema")
-        measure = props.get("reliability", "evidence")
-        by_normal = props.get("reliability_normals", False)
-        self._check(self.cache.blend in BLENDS, f"blend is '{self.cache.blend}'; give one of: {', '.join(BLENDS)}")
-        self._check(measure in MEASURES, f"reliability is '{measure}'; give one of: {', '.join(MEASURES)}")
-        self.cache.reliability = Reliability(measure=measure, split_normals=by_normal)
-        rate = props.get("last_rate", 0.1 if self.cache.blend == "ema" else 1.0)
-        self._check(0 < rate <= 1, f"last_rate is {rate}; it must be greater than 0 and at most 1")
-        self.cache.training = replace(self.cache.training, last_rate=rate)
         self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
         self._check(self.light_samples == -1 or self.light_samples >= 1,
                     f"light_samples is {self.light_samples}; give -1 (chosen by noise) or at least 1")  # fmt: skip
@@ -44,6 +36,13 @@ class NIRCIntegrator(CacheIntegrator):
                     f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
         self._check(self.gather_half >= 0, f"gather_half is {self.gather_half}; it must be 0 or more")
+        if self.termination == "auto":
+            self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; termination 'auto' needs 'ema'")
+            self._check(self.cache_samples > 0, "cache_samples is 0; termination 'auto' needs at least 1")
+            training = OutgoingTraining.like(self.cache.training, threshold=self.spread_threshold)
+            self.cache = PairCache(
+                training, self.cache.training, self.cache.shape, self.seed, n_queries=self.cache_samples
+            )
 
     @property
     def needs_cache(self) -> bool:
@@ -60,7 +59,7 @@ class NIRCIntegrator(CacheIntegrator):
 
     def settle(self, scene, sensor) -> None:
         """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene."""
-        if self.light_samples > 0:
+        if self.light_samples > 0 or self.termination == "auto":
             return
         n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
@@ -94,6 +93,8 @@ class NIRCIntegrator(CacheIntegrator):
 
     def mixture(self, spp: int) -> float:
         """Share of far light that is gathered: 0 for a single sample a pixel, 1/2 after `gather_half` more."""
+        if self.termination == "auto":
+            return float(spp)
         if self.termination != "adaptive":
             return {"primary": 0.0, "spread": 1.0, "balanced": 0.0}[self.termination]
         more = max(spp - 1, 0)
@@ -103,6 +104,11 @@ class NIRCIntegrator(CacheIntegrator):
 
     def estimate(self, scene, lights, field, sampler, ray, mixture, active):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
+        if self.termination == "auto":
+            L, visible, c = automatic.estimate(self, scene, lights, field, sampler, ray, mixture, active)
+            names = {"direct": "traced", "cache": "cached", "depth": "depth", "share": "share"}
+            empty = {n: mi.Color3f(0) if k == 3 else mi.Float(0) for n, k in self.CHANNELS.items()}
+            return L, visible, empty | {name: c[theirs] for name, theirs in names.items()}
         L, β, ray, si, depth, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
         bsdf = si.bsdf(ray)
         n_light = self.n_light
@@ -113,9 +119,9 @@ class NIRCIntegrator(CacheIntegrator):
         # Of the traced samples, so many gather what lies far: as few as the share allows, to save the rest their rays
         n_gather = dr.clip(dr.ceil(mixture * n_light), 1, n_light)
         zero = mi.Color3f(0)
-        state = (mi.UInt32(0), mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero), sampler)
+        state = (mi.UInt32(0), mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero), mi.UInt32(0), sampler)
 
-        def traced_sample(i, direct, cache, residual, sampler):
+        def traced_sample(i, direct, cache, residual, n_rays, sampler):
             # ------------------- One BSDF sample ----------------------
             bs, weight = bsdf.sample(
                 mi.BSDFContext(), si, sampler.stratified_1d(LOBE, n_light, i),
@@ -148,13 +154,13 @@ class NIRCIntegrator(CacheIntegrator):
             far = dr.select(mi.Float(i) < n_gather, mixture * n_light / n_gather, 0)
             share = self.gather_share(delta, bs.pdf, spread, a_0, far) if cached else mi.Float(1)
             follow = alive & (share > 0) & si_next.is_valid()
-            Li, sampler = self.gather(
+            Li, more, sampler = self.gather(
                 scene, lights, field, sampler, next_ray, si_next, depth + 1, weight, bs, spread, a_0, follow
             )
             residual += dr.select(alive, share * (Li - Li_cache), 0)
-            return i + 1, direct, cache, residual, sampler
+            return i + 1, direct, cache, residual, n_rays + dr.select(follow, more + 1, 0), sampler
 
-        _, direct, cache, residual, sampler = dr.while_loop(
+        _, direct, cache, residual, n_rays, sampler = dr.while_loop(
             state, lambda i, *_: active & (i < n_light), traced_sample, label="traced samples"
         )
 
@@ -180,11 +186,8 @@ class NIRCIntegrator(CacheIntegrator):
         direct, residual = direct / n_light, residual / n_light
         L += dr.select(active, β * (direct + cache + residual), 0)
         channels = {"direct": β * direct, "cache": β * cache, "residual": β * residual}
-        if cached and isinstance(field, Blend):
-            sigma = field.sigma(si.p, si.sh_frame.n)
-            channels |= {"sigma": sigma, "preference": dr.select(sigma > 0.5, mi.Float(1), 0)}
-        else:
-            channels |= {"sigma": mi.Float(0), "preference": mi.Float(0)}
+        channels |= {"depth": depth + mi.Float(n_rays) / n_light, "share": mi.Float(0)}
+        channels |= sigma_channels(field if cached else None, si.p, si.sh_frame.n)
         return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
 
     def first_vertex(self, scene, sampler, ray, active):
@@ -258,14 +261,14 @@ class NIRCIntegrator(CacheIntegrator):
         """Light that `si`, `depth` segments from the camera, reflects back along `ray`, times β.
 
         Next-event estimation there, the rest from the cache at the first vertex where the path is wide enough, by path
-        tracing up to there.
+        tracing up to there. Returns (light, rays that were traced for more than direct light, sampler).
         """
         ctx = mi.BSDFContext()
         cached = self.needs_cache and field is not None
         max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
         active = active & (depth < max_depth)
 
-        def one_vertex(depth, ray, si, β, η, L, spread, active, sampler):
+        def one_vertex(depth, ray, si, β, η, L, spread, n_rays, active, sampler):
             bsdf = si.bsdf(ray)
             smooth = active & vertex.has_smooth(bsdf)
             wide = smooth & termination.exceeds(spread, a_0, self.spread_threshold) if cached else mi.Bool(False)
@@ -296,17 +299,18 @@ class NIRCIntegrator(CacheIntegrator):
             L += β * L_nee + β_next * Le
             β = β_next
             active = followed & si_next.is_valid() & (depth < max_depth)
+            n_rays += dr.select(active, 1, 0)
             spread += dr.select(
                 delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
             )
-            return depth, next_ray, si_next, β, η, L, spread, active, sampler
+            return depth, next_ray, si_next, β, η, L, spread, n_rays, active, sampler
 
         state = (mi.UInt32(depth), mi.Ray3f(ray), si, mi.Color3f(β), mi.Float(bs.eta), mi.Color3f(0), mi.Float(spread),
-                 mi.Bool(active), sampler)  # fmt: skip
-        _, _, _, _, _, L, _, _, sampler = dr.while_loop(
-            state, lambda depth, ray, si, β, η, L, spread, active, sampler: active, one_vertex, label="gather"
+                 mi.UInt32(0), mi.Bool(active), sampler)  # fmt: skip
+        _, _, _, _, _, L, _, n_rays, _, sampler = dr.while_loop(
+            state, lambda *state: state[8], one_vertex, label="gather"
         )
-        return L, sampler
+        return L, n_rays, sampler
 
     def to_string(self):
         return (
@@ -318,7 +322,9 @@ class NIRCIntegrator(CacheIntegrator):
         )
 
 
-NIRCIntegrator.CHANNELS = {"direct": 3, "cache": 3, "residual": 3, "sigma": 1, "preference": 1}
+NIRCIntegrator.CHANNELS = {
+    "direct": 3, "cache": 3, "residual": 3, "sigma": 1, "preference": 1, "depth": 1, "share": 1
+}  # fmt: skip
 NIRCIntegrator.__doc__ = (
     r"""
     .. _integrator-nirc:
@@ -349,7 +355,7 @@ NIRCIntegrator.__doc__ = (
        - Share of far light that is gathered. ``primary``: none, least noise, most bias. ``spread``: all, the path goes
          on until its spread exceeds that of the pixel (Müller et al. 2021, sec. 3.4). ``balanced``: 1 - t with
          t = Nc p_f / (Nc p_f + p_g) (Dereviannykh et al.). ``adaptive``: none for one sample a pixel, growing with the
-         image's sample count, as noise gives way to bias. (Default: adaptive)
+         image's sample count, as noise gives way to bias. ``auto``: another estimator, see below. (Default: adaptive)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is asked per camera sample. 0: no cache, ``nirc`` is a path tracer.
@@ -364,30 +370,20 @@ NIRCIntegrator.__doc__ = (
      * - gather_half
        - |float|
        - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)
-     * - blend
-       - |string|
-       - Which weights answer. ``ema``: their average, least noise, lags behind changes. ``fast``: those being trained.
-         ``reliability``: (1 - σ) average + σ trained, σ by place from how both agree with the training records; as
-         quick as ``fast`` where light changes, as still as ``ema`` elsewhere. ``switch``: the same with σ rounded to 0
-         or 1. For scenes that change; in still ones ``ema`` is best. (Default: ema)
-     * - reliability
-       - |string|
-       - How σ is found: ``evidence`` (a test whether the trained weights are better), ``correlation``, ``concordance``,
-         ``regression``. (Default: evidence)
-     * - reliability_normals
-       - |bool|
-       - Keep statistics apart by the six main directions of the normal. (Default: false)
-     * - last_rate
-       - |float|
-       - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be
-         quick)
     """
     + SHARED_KEYS.strip("\n")
     + r"""
 
+    """
+    + AUTO.strip("\n")
+    + r"""
+    It traces one BSDF sample a vertex (``light_samples``, ``gather_half`` have no effect).
+
     Channels: ``direct``, ``cache``, ``residual`` (RGB each); with visible emission they sum to the image. ``sigma``:
     weight of the network being trained, at the first vertex; ``preference``: 1 where it exceeds 1/2. Its mean over a
-    frame's records is ``reliability`` in the statistics.
+    frame's records is ``reliability`` in the statistics. ``depth``: mean length of paths in segments, those that find
+    direct light alone not counted. With ``auto``: ``direct`` is all that was traced, ``share`` the weight of the
+    outgoing cache at the first vertex.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
     participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside

@@ -1,22 +1,21 @@
 """``nrc``: paths that end in a neural outgoing radiance cache."""
 
 import math
-import time
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
+from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.field import CacheFileError
-from mi_neural.caches.outgoing import OutgoingCache, OutgoingField, OutgoingShape, OutgoingTraining
-from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator, _other_scene
-from mi_neural.transport import vertex
-from mi_neural.transport.samples import PathSampler
-from mi_neural.transport.suffixes import scene_is_glossy, surface_of
-from mi_neural.transport.termination import PathSpread
+from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape, OutgoingTraining
+from mi_neural.caches.pair import PairCache
+from mi_neural.integrators import automatic, prefix
+from mi_neural.integrators.automatic import AUTO
+from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.transport.suffixes import surface_of
 
-#: Dimensions of the stratified numbers of the first vertex
-AA, NEE, BSDF, LOBE, LIGHT = range(5)
+#: Where paths end
+TERMINATIONS = ("spread", "auto")
 #: The constants of a training step in the words of the plugin's keys
 KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cache_content",
         "threshold": "spread_threshold", "roughening": "roughening"}  # fmt: skip
@@ -27,6 +26,11 @@ class NRCIntegrator(CacheIntegrator):
         super().__init__(props)
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self.content = props.get("cache_content", "reflected")
+        self.termination = props.get("termination", "spread")
+        self._check(self.termination in TERMINATIONS,
+                    f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
+        if self.termination == "auto":
+            self._check(self.content == "reflected", "termination 'auto' needs cache_content 'reflected'")
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
         # A path of infinite spread threshold never asks the cache; its training paths end by the paper's constant
         chosen = {
@@ -39,19 +43,23 @@ class NRCIntegrator(CacheIntegrator):
         }
         shared, sizes = self.cache.training, self.cache.shape
         try:
-            training = OutgoingTraining(
-                n_paths=shared.n_paths, n_vertices=shared.n_vertices, learning_rate=shared.learning_rate,
-                ema_decay=shared.ema_decay, **chosen,
-            )  # fmt: skip
+            training = OutgoingTraining.like(shared, **chosen)
         except ValueError as e:
             message = str(e)
             for name, key in KEYS.items():
                 message = message.replace(f"{name} is", f"{key} is")
             raise ValueError(f"{self.plugin}: {message}") from None
-        shape = OutgoingShape(
-            n_levels=sizes.n_levels, hashmap_size=sizes.hashmap_size, width=sizes.width, n_hidden=sizes.n_hidden
-        )
-        self.cache = OutgoingCache(training, shape, seed=self.seed)
+        if self.termination == "auto":
+            self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; termination 'auto' needs 'ema'")
+            self.cache = PairCache(training, shared, sizes, self.seed)
+        else:
+            self.cache = OutgoingCache(
+                training, OutgoingShape.like(sizes), self.seed, blend=self.cache.blend,
+                reliability=self.cache.reliability,
+            )  # fmt: skip
+
+    def mixture(self, spp: int) -> float:
+        return float(spp)
 
     @property
     def needs_cache(self) -> bool:
@@ -65,160 +73,49 @@ class NRCIntegrator(CacheIntegrator):
 
     def estimate(self, scene, lights, field, sampler, ray, mixture, active):
         """E[L] = path tracing up to the vertex where the spread exceeds that of the pixel, and the cache there."""
-        ctx = mi.BSDFContext()
+        if self.termination == "auto":
+            return automatic.estimate(self, scene, lights, field, sampler, ray, mixture, active)
         cached = self.needs_cache and field is not None
-        glossy = scene_is_glossy(scene)
+
+        def stop(si, spread, smooth, first, sampler):
+            wide = smooth & spread.exceeds(self.spread_threshold)
+            never = mi.Bool(False)
+            return mi.Float(0), *((wide, never) if self.content == "reflected" else (never, wide))
+
         views = cached and bool({"cache", "density"} & set(self.channels))
-        max_depth = mi.UInt32(self.max_depth if self.max_depth >= 0 else 0xFFFFFFFF)
-        active = mi.Bool(active) & (max_depth > 0)
+        path = prefix.trace(self, scene, lights, sampler, ray, active, stop if cached else None, views)
 
-        # --------------------- What the camera sees --------------------
-        if self.hide:
-            pi = self.skip_area_emitters(scene, mi.Ray3f(ray), True, active)
-            si = pi.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, active)
-        else:
-            si = scene.ray_intersect(ray, active)
-        shown = active & (si.is_valid() | (not self.hide))
-        L = vertex.emission(scene, si, shown)
-        visible = active & si.is_valid() | shown & (dr.max(L) > 0)
-        active &= si.is_valid() & (max_depth > 1)
-
-        def is_smooth(si, active):
-            return active & si.is_valid() & vertex.has_smooth(si.bsdf())
-
-        smooth = is_smooth(si, active)
-        spread = PathSpread.start(dr.width(si.t)).arrive(si, ray, mi.Float(1), mi.Bool(True), smooth)
-        asks = smooth & spread.exceeds(self.spread_threshold) if cached else mi.Bool(False)
-        view = (surface_of(si, si.bsdf(), smooth, glossy), dr.select(smooth, mi.Color3f(1), 0)) if views else ()
-        # Numbers of the first vertex, which spread evenly over the samples of a pixel
-        first = [sampler.stratified_1d(LOBE), sampler.stratified_2d(BSDF), sampler.stratified_1d(LIGHT),
-                 sampler.stratified_2d(NEE)]  # fmt: skip
-
-        def bounce(depth, ray, si, β, η, L, spread, asks, active, sampler, *view):
-            # ------------------- One BSDF sample ----------------------
-            bsdf = si.bsdf(ray)
-            independent = [sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_2d()]
-            u_lobe, u_bsdf, u_light, u_nee = (
-                dr.select(depth == 1, a, b) for a, b in zip(first, independent, strict=True)
-            )
-            bs, weight = bsdf.sample(ctx, si, u_lobe, u_bsdf, active)
-            weight = vertex.finite(weight, active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            next_ray = si.spawn_ray(si.to_world(bs.wo))
-            followed = active & (dr.max(weight) > 0)
-            si_next = scene.ray_intersect(next_ray, followed)
-
-            # ---------------------- Direct light ----------------------
-            L_nee, Le = vertex.emitted(
-                scene, lights, si, bsdf, u_light, u_nee, sampler, active, si_next, bs.pdf, delta, followed
-            )
-            L += β * (L_nee + weight * Le)
-
-            # --------- Roulette (must cancel out η² to obtain unitless throughput)
-            β_next, η_next = β * weight, η * bs.eta
-            alive = followed & ~asks & si_next.is_valid() & (depth + 1 < max_depth) & (dr.max(β_next) > 0)
-            roulette = depth >= self.rr_depth
-            q = dr.minimum(dr.max(β_next) * η_next**2, 0.95)
-            alive &= ~roulette | (sampler.next_1d() < q)
-            β_next = dr.select(roulette, β_next * dr.rcp(dr.maximum(q, 1e-6)), β_next)
-
-            # --------------- Ask the cache at the next vertex? --------
-            goes_on = mi.Bool(alive)
-            if cached:
-                smooth = is_smooth(si_next, alive)
-                if view:
-                    new = smooth & ~spread.started
-                    view = (
-                        dr.select(new, surface_of(si_next, si_next.bsdf(), new, glossy), view[0]),
-                        dr.select(new, β_next, view[1]),
-                    )
-                spread = spread.arrive(si_next, next_ray, bs.pdf, delta, smooth)
-                wide = smooth & spread.exceeds(self.spread_threshold)
-                if self.content == "reflected":
-                    goes_on &= ~wide
-                    asks |= wide
-                else:  # once more, for direct light; then stay
-                    β_next, si_next = dr.select(asks, β, β_next), dr.select(asks, si, si_next)
-                    asks |= wide
-            return depth + dr.select(alive, 1, 0), next_ray, si_next, β_next, η_next, L, spread, asks, goes_on, \
-                sampler, *view  # fmt: skip
-
-        goes_on = active & ~asks if self.content == "reflected" else mi.Bool(active)
-        state = (mi.UInt32(1), mi.Ray3f(ray), si, mi.Color3f(1), mi.Float(1), L, spread, mi.Bool(asks), goes_on,
-                 sampler, *view)  # fmt: skip
-        depth, ray, si, β, _, L, _, asks, _, sampler, *view = dr.while_loop(
-            state, lambda *state: state[8], bounce, label="path prefix"
-        )
-
-        # ---------------------- The cache at its end ------------------
         cache = mi.Color3f(0)
         if cached:
-            surface = surface_of(si, si.bsdf(ray), asks, glossy)
-            cache = dr.select(asks, β * field.query(*surface.inputs()), 0)
-        channels = {"traced": L, "cached": cache, "depth": dr.select(visible, mi.Float(depth), 0)}
-        if {"cache", "density"} & set(self.channels):
-            channels |= {"cache": mi.Color3f(0), "density": mi.Float(0)}
-        if view:
-            surface, β_view = view
-            seen = dr.max(β_view) > 0
-            channels["cache"] = dr.select(seen, β_view * field.query(*surface.inputs()), 0)
-            channels["density"] = dr.select(seen, field.density_at(surface.position), 0)
-        return L + cache, visible, channels
+            asks = path.ends | path.ends_lit
+            surface = surface_of(path.si, path.si.bsdf(path.ray), asks, path.glossy)
+            cache = dr.select(asks, path.β * field.query(*surface.inputs()), 0)
+        channels = {"traced": path.L, "cached": cache, "depth": dr.select(path.visible, mi.Float(path.depth), 0)}
+        shown = sigma_channels(field if cached else None, path.si.p, path.si.sh_frame.n)
+        channels |= {k: dr.select(path.ends | path.ends_lit, v, 0) for k, v in shown.items()}
+        channels |= {"share": mi.Float(0), "cache": mi.Color3f(0), "density": mi.Float(0)}
+        if views:
+            seen = dr.max(path.β_first) > 0
+            channels["cache"] = dr.select(seen, path.β_first * field.query(*path.first.inputs()), 0)
+            plain = field.field if isinstance(field, OutgoingBlend) else field
+            channels["density"] = dr.select(seen, plain.density_at(path.first.position), 0)
+        return path.L + cache, path.visible, channels
 
     # -------------------------------------------------------------------------------------------------------------
 
-    def measure_query(self, n: int = 2**18) -> float:
-        """Nanoseconds per cache query. Also kept for :meth:`statistics`."""
-        field = self.cache.field
-        if field is None:
-            raise RuntimeError(f"{self.plugin}: there is no cache yet; render an image or call train() first")
+    PROBES = 1
 
-        @dr.freeze
-        def run(field, seed):
-            sampler = PathSampler.make(dr.arange(mi.UInt32, n), seed)
-            low, inv = field.box_min, field.box_inv_extent
-            x = low + mi.Vector3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / inv
-            normal, w = (mi.warp.square_to_uniform_sphere(sampler.next_2d()) for _ in range(2))
-            return field.query(x, normal, w, mi.Color3f(sampler.next_1d()), sampler.next_1d())
+    def probe(self, field, x, sampler):
+        field = getattr(field, "outgoing", field)
+        normal, w = (mi.warp.square_to_uniform_sphere(sampler.next_2d()) for _ in range(2))
+        return field.query(x, normal, w, mi.Color3f(sampler.next_1d()), sampler.next_1d())
 
-        times = []
-        with dr.suspend_grad():
-            for k in range(7):
-                dr.sync_thread()
-                t0 = time.perf_counter()
-                dr.eval(run(field, mi.UInt32(k)))
-                dr.sync_thread()
-                times.append(time.perf_counter() - t0)
-        self.state.ns_per_query = float(np.median(times[2:])) / n * 1e9
-        return self.state.ns_per_query
+    def file_facts(self) -> dict:
+        return {**super().file_facts(), "content": self.content}
 
-    def save_cache(self, path) -> None:
-        """Write the trained cache to `path`, whole or not at all."""
-        if self.cache.field is None:
-            raise RuntimeError(f"{self.plugin}: there is no cache to save yet; render an image or call train() first")
-        self.cache.field.save(
-            path, plugin="nrc", scene=self.state.signature, content=self.content,
-            statistics=dict(self.cache.statistics),
-        )  # fmt: skip
-
-    def load_cache(self, path, scene=None) -> None:
-        """Go on from a cache file. With `scene`, or once a scene was rendered: refuse a cache of another scene.
-
-        Raises `CacheFileError` (a ``ValueError``).
-        """
-        field, header = OutgoingField.load(path)
-        if field.shape != self.cache.shape:
-            raise CacheFileError(f"'{path}' holds a cache of {field.shape}, this integrator has {self.cache.shape}; "
-                                 "give it the same sizes")  # fmt: skip
+    def check_file(self, path, header: dict) -> None:
         if header.get("content", self.content) != self.content:
             raise CacheFileError(f"'{path}' holds {header['content']} light; set cache_content to {header['content']}")
-        if scene is not None:
-            self._ready(scene, self._sensor(scene, 0), train=False)
-        known = self.state.signature
-        if known is not None and header.get("scene") != known:
-            raise CacheFileError(_other_scene(path))
-        self.cache.adopt(field)
-        self.state.loaded = (path, header.get("scene"))
 
     def to_string(self):
         return (
@@ -229,7 +126,9 @@ class NRCIntegrator(CacheIntegrator):
         )
 
 
-NRCIntegrator.CHANNELS = {"traced": 3, "cached": 3, "cache": 3, "depth": 1, "density": 1}
+NRCIntegrator.CHANNELS = {
+    "traced": 3, "cached": 3, "cache": 3, "depth": 1, "share": 1, "density": 1, "sigma": 1, "preference": 1
+}  # fmt: skip
 NRCIntegrator.__doc__ = (
     r"""
     .. _integrator-nrc:
@@ -264,6 +163,10 @@ NRCIntegrator.__doc__ = (
        - The constant c: 0 asks the cache at the first surface that is not a mirror, infinity never (``nrc`` is a path
          tracer). An SDK defines :math:`a_0` as :math:`4\pi |x_0-x_1|^2 / |\cos\theta_1|`, 158 times as large: give
          158 times its constant. (Default: 0.01)
+     * - termination
+       - |string|
+       - Where paths end. ``spread``: as above. ``auto``: by what was measured of both caches, see below. (Default:
+         spread)
      * - cache_content
        - |string|
        - What the cache holds. ``reflected``: all reflected light. ``indirect``: without direct light, which is traced
@@ -288,10 +191,17 @@ NRCIntegrator.__doc__ = (
     + SHARED_KEYS.strip("\n")
     + r"""
 
+    """
+    + AUTO.strip("\n")
+    + r"""
+    The incident cache is asked in 4 directions; ``cache_content`` must be ``reflected``.
+
     Channels: ``traced``, ``cached`` (RGB each; with visible emission in ``traced`` they sum to the image), ``cache``
     (RGB: the cache seen directly at the first vertex), ``depth`` (segments up to the end of the path: a heat map of
-    where paths end), ``density`` (training records per frame near the first vertex, in a cell of 1/32 of the box).
-    ``statistics()["loss"]`` is the loss of the latest training frame, ``cache.history`` holds those of all.
+    where paths end), ``share`` (weight of the cache at the first vertex, with ``auto``), ``density`` (training records
+    per frame near the first vertex, in a cell of 1/32 of the box), ``sigma`` and ``preference`` (of ``blend``: weight
+    of the network being trained where the cache was asked, and 1 where it exceeds 1/2). ``statistics()["loss"]`` is the
+    loss of the latest training frame, ``cache.history`` holds those of all.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
     participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside

@@ -1,4 +1,4 @@
-"""`Blend`: two predictors as one, and `nirc` with it: limit cases, jit, a light that changes."""
+"""`Blend`: two predictors as one, and `nirc` and `nrc` with it: limit cases, jit, a light that changes."""
 
 import drjit as dr
 import mitsuba as mi
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from test_incident import load, same
 
-from mi_neural.caches.blend import BLENDS, Blend
+from mi_neural.caches.blend import BLENDS, Blend, OutgoingBlend
 from mi_neural.caches.field import Field, FieldShape
 from mi_neural.caches.incident import IncidentCache, Training
+from mi_neural.caches.outgoing import OutgoingField, OutgoingShape
 from mi_neural.caches.reliability import MEASURES, Reliability
 
 SHAPE = FieldShape(n_levels=4, hashmap_size=2**10, width=16, n_hidden=1)
@@ -82,6 +83,25 @@ def test_sigma_that_differs_from_lane_to_lane_is_that_of_each(points):
     sigma = np.array(blend.sigma(points[0], mi.Normal3f(0, 0, 1)))
     assert set(np.unique(sigma)) == {0, 0.25, 0.5, 1}
     np.testing.assert_allclose(answers(blend, points), (1 - sigma) * averaged + sigma * current, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode, sigma", [("fast", 1.0), ("reliability", 0.0), ("reliability", 1.0),
+                                         ("reliability", 0.3), ("switch", 0.7)])  # fmt: skip
+def test_outgoing_blend_is_the_mix_of_its_two_predictors(points, mode, sigma):
+    field = OutgoingField([-1] * 3, [1] * 3, OutgoingShape(n_levels=2, hashmap_size=2**8, width=8, n_hidden=1))
+    rng = np.random.default_rng(1)
+    field.restore({k: rng.normal(size=v.shape).astype(np.float32) for k, v in field.snapshot().items()})
+    blend = OutgoingBlend(field, mode)
+    if blend.grid is not None:
+        blend.grid.sigma = dr.opaque(mi.Float, sigma, blend.grid.constants.n_entries)
+    x, w = points
+    inputs = x, mi.Vector3f(0, 0, 1) + 0 * w, w, mi.Color3f(0.5) + 0 * x.x, 0 * x.x
+    field.sync()
+    averaged, current = (np.array(field.query(*inputs, averaged=a)) for a in (True, False))
+    assert np.abs(averaged - current).mean() > 0.1
+    share = round(sigma) if mode == "switch" else sigma
+    expected = (1 - share) * averaged + share * current
+    np.testing.assert_allclose(np.array(blend.query(*inputs)), expected, rtol=1e-5, atol=1e-6)
 
 
 # ---------------------------------------------------------------- jit
@@ -161,23 +181,33 @@ def test_rollback_brings_back_the_field_that_a_restart_replaced():
     assert cache.field is cache.asked.field is field and field.scale[0] == scale
 
 
-# ---------------------------------------------------------------- nirc
+# ---------------------------------------------------------------- integrators
 
 
 def nirc(**keys):
     return mi.load_dict({"type": "nirc", "train_samples": 256, "train_frames": 0, "light_samples": 1, **keys})
 
 
+def nrc(**keys):
+    return mi.load_dict({"type": "nrc", "train_samples": 256, "train_frames": 0, **keys})
+
+
+#: Each with its cache asked as early as it goes.
+INTEGRATORS = {"nirc": lambda **keys: nirc(termination="primary", **keys),
+               "nrc": lambda **keys: nrc(spread_threshold=0.0, **keys)}  # fmt: skip
+
+
 def mean_error(images, known):
     return np.abs(np.array([i.mean() for i in images]) - known).mean() / known
 
 
-def test_blend_follows_a_light_as_quickly_as_fast_and_keeps_still_as_the_average():
-    """The light of the sphere becomes a quarter after 150 frames; the indirect half of the image must follow."""
+@pytest.mark.parametrize("plugin", INTEGRATORS)
+def test_blend_follows_a_light_as_quickly_as_fast_and_keeps_still_as_the_average(plugin):
+    """The light of the sphere becomes a quarter after 160 frames; what the cache holds of the image must follow."""
     after, still = {}, {}
     for mode in ("ema", "fast", "reliability"):
         scene, _ = load("point_lit_sphere", 8)
-        integrator = nirc(blend=mode, termination="primary")
+        integrator = INTEGRATORS[plugin](blend=mode)
         integrator.train(scene, 160)
         images = [np.array(integrator.render(scene, spp=16, seed=k)) for k in range(6)]
         still[mode] = np.mean([np.abs(np.diff(images, axis=0)).mean()])
@@ -192,10 +222,11 @@ def test_blend_follows_a_light_as_quickly_as_fast_and_keeps_still_as_the_average
     assert still["reliability"] < 1.1 * still["ema"]
 
 
-def test_channels_show_which_predictor_is_asked():
+@pytest.mark.parametrize("plugin", INTEGRATORS)
+def test_channels_show_which_predictor_is_asked(plugin):
     scene, _ = load("point_lit_sphere", 8)
     for mode, value in (("ema", 0), ("fast", 1), ("reliability", 0)):
-        integrator = nirc(blend=mode, channels="sigma, preference")
+        integrator = INTEGRATORS[plugin](blend=mode, channels="sigma, preference")
         integrator.train(scene, 1)
         image = np.array(integrator.render(scene, spp=1))
         assert image.shape[-1] == 5 and (image[..., 3:] == value).all()

@@ -12,15 +12,8 @@ import pytest
 
 from mi_neural.caches import encoding
 from mi_neural.caches.field import CacheFileError, Field, FieldShape, own_copy
-from mi_neural.caches.outgoing import (
-    ALBEDO_MIN,
-    CacheInput,
-    DispatchFlags,
-    OutgoingField,
-    OutgoingShape,
-    RadianceCache,
-    self_training_frame,
-)
+from mi_neural.caches.outgoing import ALBEDO_MIN, OutgoingField, OutgoingShape
+from mi_neural.caches.radiance_cache import CacheInput, DispatchFlags, RadianceCache, self_training_frame
 
 TINY = OutgoingShape(
     n_levels=2, hashmap_size=128, base_resolution=3, direction_degree=1, normal_degree=1, width=8, n_hidden=1

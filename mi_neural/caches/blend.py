@@ -71,15 +71,11 @@ class Blend:
         """What depends on the position alone, of either predictor where it counts."""
         if self.grid is None:
             return None, None, self.field.features(self.fast, x)
-        sigma = self.sigma(x, n)
+        sigma, n_values = self.sigma(x, n), self.field.shape.n_features_total
         return sigma, *(
-            _where(asks, (mi.Point3f(x),), lambda x, w=weights: tuple(self.field.features(w, x)), self._n_features)
+            where_active(asks, (mi.Point3f(x),), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
             for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))
         )
-
-    @property
-    def _n_features(self) -> int:
-        return self.field.shape.n_levels * self.field.shape.n_features
 
     def query(self, features: tuple, w):
         """Radiance from direction `w` at the encoded position; never negative."""
@@ -87,8 +83,8 @@ class Blend:
         if sigma is None:
             return self.field.answer(self.fast, list(fast), w)
         answers = [
-            mi.Color3f(*_where(asks, (mi.Vector3f(w), *values),
-                               lambda w, *v, weights=weights: tuple(self.field.answer(weights, list(v), w)), 3))
+            mi.Color3f(*where_active(asks, (mi.Vector3f(w), *values),
+                                     lambda w, *v, weights=weights: tuple(self.field.answer(weights, list(v), w)), 3))
             for asks, values, weights in ((sigma < 1, averaged, self.field.averaged), (sigma > 0, fast, self.fast))
         ]  # fmt: skip
         return (1 - sigma) * answers[0] + sigma * answers[1]
@@ -103,7 +99,37 @@ class Blend:
             self.grid.update(records.position, records.normal, records.valid, y, current, averaged)
 
 
-def _where(active, args: tuple, function, n_outputs: int) -> tuple:
+class OutgoingBlend(Blend):
+    """The same of an :class:`~mi_neural.caches.outgoing.OutgoingField`, with its queries."""
+
+    def query(self, x, n, w, albedo, roughness):
+        """Radiance that leaves the surface towards `w`; never negative, and 0 where an input is not usable."""
+        if self.grid is None:
+            return self.field.answer(self.fast, x, n, w, albedo, roughness)
+        sigma, inputs = self.sigma(x, n), (x, n, w, albedo, roughness)
+        answers = [
+            mi.Color3f(*where_active(
+                asks, inputs, lambda *inputs, weights=weights: tuple(self.field.answer(weights, *inputs)), 3
+            ))
+            for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))
+        ]  # fmt: skip
+        return (1 - sigma) * answers[0] + sigma * answers[1]
+
+    def observe_surfaces(self, x, n, valid, y, current, averaged) -> None:
+        """Score both predictions at surfaces, made before the step, against targets `y`; all three over the
+        reflectance."""
+        if self.grid is not None:
+            self.grid.update(x, n, valid, y, current, averaged)
+
+
+def sigma_channels(asked, x, n) -> dict:
+    """Channels that show which predictor answers at points with unit normals: ``sigma``, its weight, and
+    ``preference``, 1 where that exceeds 1/2; both 0 where what is `asked` is no blend."""
+    sigma = asked.sigma(x, n) if isinstance(asked, Blend) else mi.Float(0)
+    return {"sigma": sigma, "preference": dr.select(sigma > 0.5, mi.Float(1), 0)}
+
+
+def where_active(active, args: tuple, function, n_outputs: int) -> tuple:
     """``function(*args)``, a tuple of floats, where `active`; 0 elsewhere. Packets with no active lane skip it."""
     nothing = lambda *_: tuple(mi.Float(0) for _ in range(n_outputs))  # noqa: E731
     return dr.if_stmt(args, active, function, nothing, label="predictor")

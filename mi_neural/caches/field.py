@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import drjit as dr
 import drjit.nn as nn
@@ -13,14 +10,11 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from . import encoding
+from . import encoding, files
+from .files import CacheFileError as CacheFileError
 
 #: Changes when a file written before cannot be read any more.
 FILE_VERSION = 1
-
-
-class CacheFileError(ValueError):
-    """A cache file that cannot be used; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +54,13 @@ class FieldShape:
             raise ValueError(f"hashmap_size ({self.hashmap_size}) must be a multiple of n_features ({self.n_features})")
 
     @property
+    def n_features_total(self) -> int:
+        """Values that the hash grid gives for a position."""
+        return self.n_levels * self.n_features
+
+    @property
     def n_inputs(self) -> int:
-        return self.n_levels * self.n_features + (self.direction_degree + 1) ** 2
+        return self.n_features_total + (self.direction_degree + 1) ** 2
 
 
 def own_copy(value):
@@ -291,54 +290,43 @@ class Field:
     # -------------------------------------------------------------------------------------------------------------
     # Files
 
+    def n_parameters(self) -> int:
+        """Number of trained numbers."""
+        return sum(int(np.prod(v.shape)) for v in self.averaged.parameters().values())
+
+    def state(self) -> tuple:
+        """All that training changes, for :meth:`set_state`; the optimiser's moments are not in it."""
+        return self.snapshot(), mi.Float(self.mean), self.steps
+
+    def set_state(self, state: tuple) -> None:
+        """Go back to what :meth:`state` gave."""
+        arrays, self.mean, self.steps = state
+        self.restore(arrays)
+
+    def header(self) -> dict:
+        """What a file says of the field beside its weights, in JSON values."""
+        return {
+            "version": FILE_VERSION, "shape": asdict(self.shape), "box": self.box, "scale": float(self.scale[0]),
+            "mean": float(self.mean[0]), "seed": self.seed, "steps": self.steps,
+        }  # fmt: skip
+
+    @staticmethod
+    def of_parts(header: dict, arrays: dict[str, np.ndarray]) -> Field:
+        """The field of a :meth:`header` and a :meth:`snapshot`. Raises what impossible ones lead to."""
+        field = Field(*header["box"], FieldShape(**header["shape"]), scale=header["scale"], seed=header["seed"])
+        files.check_arrays(arrays, field.snapshot())
+        mean, steps = header["mean"], header["steps"]
+        if not (isinstance(steps, int) and steps >= 0 and np.isfinite(mean) and mean >= 0):
+            raise ValueError(f"it says that {steps} steps were made, and a mean of {mean} found")
+        field.restore(arrays)
+        field.mean, field.steps = dr.opaque(mi.Float, mean), steps
+        return field
+
     def save(self, path, **facts) -> None:
         """Write weights, shape, box, scale and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
-        path = Path(path)
-        header = {
-            "version": FILE_VERSION, "shape": asdict(self.shape), "box": self.box, "scale": float(self.scale[0]),
-            "mean": float(self.mean[0]), "seed": self.seed, "steps": self.steps, **facts,
-        }  # fmt: skip
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            with open(temporary, "wb") as file:
-                np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **self.snapshot())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        files.write(path, {**self.header(), **facts}, self.snapshot())
 
     @staticmethod
     def load(path) -> tuple[Field, dict]:
-        """The field of a file, and its header. No code in the file is run.
-
-        Raises `CacheFileError` for a file that is missing, cut short, not ours, or of another version.
-        """
-        path = Path(path)
-        try:
-            # Opened here: np.load() leaves a damaged file open
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as entries:
-                arrays = {k: entries[k] for k in entries.files}
-            header = json.loads(bytes(arrays.pop("header")).decode())
-            version = header["version"]
-        except FileNotFoundError:
-            raise CacheFileError(f"there is no cache file '{path}'") from None
-        except Exception as e:
-            raise CacheFileError(f"'{path}' is not a cache file of mi_neural, or is damaged ({e})") from None
-        if version != FILE_VERSION:
-            raise CacheFileError(
-                f"'{path}' has cache format {version}, this version reads {FILE_VERSION}; train and save it again"
-            )
-        try:
-            field = Field(*header["box"], FieldShape(**header["shape"]), scale=header["scale"], seed=header["seed"])
-            expected = {k: v.shape for k, v in field.snapshot().items()}
-            if {k: v.shape for k, v in arrays.items()} != expected:
-                raise ValueError("its arrays do not have the sizes that its header says")
-            if not all(np.isfinite(v).all() for v in arrays.values()):
-                raise ValueError("it holds weights that are not finite")
-            mean, steps = header["mean"], header["steps"]
-            if not (isinstance(steps, int) and steps >= 0 and np.isfinite(mean) and mean >= 0):
-                raise ValueError(f"it says that {steps} steps were made, and a mean of {mean} found")
-            field.restore(arrays)
-            field.mean, field.steps = dr.opaque(mi.Float, mean), steps
-        except Exception as e:
-            raise CacheFileError(f"'{path}' is not a cache file of mi_neural, or is damaged ({e})") from None
-        return field, header
+        """The field of a file, and its header; errors as of :func:`.files.read`."""
+        return files.read(path, FILE_VERSION, None, Field.of_parts)

@@ -168,6 +168,8 @@ class IncidentCache:
     BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
+    #: What is trained, and what blends its two sets of weights.
+    FIELD, BLEND = Field, Blend
 
     def __init__(
         self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0, *, blend: str = "ema",
@@ -201,8 +203,12 @@ class IncidentCache:
         if self.field is None or self.blend == "ema":
             return self.field
         if self._blend is None or self._blend.field is not self.field:
-            self._blend = Blend(self.field, self.blend, self.reliability)
+            self._blend = self.BLEND(self.field, self.blend, self.reliability)
         return self._blend
+
+    def measured(self) -> dict:
+        """Further facts for statistics."""
+        return {}
 
     def freezes(self, sensor) -> bool:
         """Whether functions of this sensor can be frozen, see :func:`can_freeze`; tried once per sensor."""
@@ -315,7 +321,7 @@ class IncidentCache:
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field, self.field.snapshot(), mi.Float(self.field.mean)),
+            None if self.field is None else (self.field, self.field.state()),
             None if self._blend is None else self._blend.snapshot(),
             self.steps, self.rate_factor, list(self.history), self._good, dict(self.statistics),
         )  # fmt: skip
@@ -328,15 +334,13 @@ class IncidentCache:
             field.reset()
             self.field = field
             return
-        weights, blend, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
-        if weights is not None:
-            self.field, arrays, mean = weights  # training may have begun a new one
-            self.field.restore(arrays)
-            self.field.mean = mean
+        held, blend, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
+        if held is not None:
+            self.field, kept = held  # training may have begun a new one
+            self.field.set_state(kept)
             if self._blend is not None and blend is not None:
                 self._blend.restore(blend)
             self.levels = []
-            self.field.steps = self.steps
 
     def settled(self) -> bool:
         """Whether the loss has stopped falling: its median over the last 64 steps is within 2 % of the 64 before."""

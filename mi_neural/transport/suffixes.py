@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from . import vertex
-from .records import MAX_CHAIN
+from .records import MAX_CHAIN, TrainingRecords, empty_records
+from .samples import PathSampler
 from .termination import PathSpread
 
 #: Contents of a cache: all light that a surface reflects, or that without direct light.
@@ -116,6 +117,22 @@ def _empty(n: int) -> OutgoingRecords:
     return OutgoingRecords(Surface(*vectors, dr.zeros(mi.Float, n)), dr.zeros(mi.Color3f, n), dr.zeros(mi.Bool, n))
 
 
+@dataclass
+class Bounces:
+    """What happened at the vertices of training paths, vertex by vertex; beside their `OutgoingRecords`.
+
+    direct     direct light that the vertex reflects towards its viewer, traced
+    weight     ``f cos/p`` of the BSDF ray that left it
+    incident   records of the radiance that this ray brought back, emission excluded; valid for rays of smooth lobes
+    stops      whether the vertex that the ray met is where a pixel's path would end in the cache
+    """
+
+    direct: mi.Color3f
+    weight: mi.Color3f
+    incident: TrainingRecords
+    stops: mi.Bool
+
+
 @dataclass(frozen=True)
 class Suffixes:
     """How training paths run.
@@ -129,6 +146,7 @@ class Suffixes:
     world_share     share of the paths that start where earlier records lay, in place of the camera
     roughening      at each further bounce this share of a surface's BSDF becomes Lambertian
     content         see `CONTENTS`
+    twins           whether the paths 2k and 2k + 1 start with the same ray
     """
 
     n_paths: int
@@ -139,6 +157,7 @@ class Suffixes:
     world_share: float
     roughening: float
     content: str
+    twins: bool = False
 
 
 def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple | None):
@@ -166,8 +185,8 @@ def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple 
 
 def trace_suffixes(
     scene, sensor, sampler, plan: Suffixes, query: Callable | None, lights=None, places: tuple | None = None,
-    glossy: bool = True,
-) -> tuple[OutgoingRecords, mi.UInt32]:  # fmt: skip
+    glossy: bool = True, first: Callable | None = None,
+) -> tuple[OutgoingRecords, mi.UInt32, Bounces, mi.Color3f]:  # fmt: skip
     """Training paths; each vertex with a smooth lobe, but the last, gives one record.
 
     The radiance reflected at vertex k is
@@ -179,7 +198,9 @@ def trace_suffixes(
     the end of a path ``query(surface)`` stands for what the cache holds of S (self-training; None: nothing). Paths
     that left the scene, or that run on without an end, are not self-trained.
 
-    Returns ``n_paths * (n_vertices - 1)`` records, and how many targets were not finite and were left out.
+    Returns ``n_paths * (n_vertices - 1)`` records, how many targets were not finite and were left out, the bounces that
+    gave them (of equal number), and what ``first(si, bsdf, active, sampler)`` says of the first vertex of each path
+    (None: black).
     """
     n_paths, n_kept = plan.n_paths, plan.n_vertices - 1
     size = n_paths * n_kept
@@ -189,6 +210,7 @@ def trace_suffixes(
 
     records = _empty(size)
     E, N, f = (dr.zeros(mi.Color3f, size) for _ in range(3))
+    direction, rough, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
 
     def step(ray, si, n_rough, active, sampler, albedo=None):
         """One bounce: (next ray, what it met, BSDF weight, N, E, its density, delta, alive)."""
@@ -226,21 +248,31 @@ def trace_suffixes(
         for to, value in zip(records.surface.inputs(), surface.inputs(), strict=True):
             dr.scatter(to, value, i)
         dr.scatter(records.valid, smooth, i)
+        dr.scatter(direction, ray.d, i)
+        dr.scatter(rough, smooth & alive & ~delta, i)
 
         open_ = alive & si_next.is_valid()
         goes_on = mi.Bool(open_)
+        smooth_next = is_smooth(si_next, open_)
+        spread = spread.arrive(si_next, ray, pdf, delta, smooth_next)
+        wide = smooth_next & spread.exceeds(plan.threshold)
+        dr.scatter(stops, wide, i)
         if plan.suffix == "spread":
-            smooth_next = is_smooth(si_next, open_)
-            spread = spread.arrive(si_next, ray, pdf, delta, smooth_next)
-            wide = smooth_next & spread.exceeds(plan.threshold)
             goes_on &= ~(wide & (ends > 0)) | unbounded
             ends += dr.select(wide, 1, 0)
             spread = spread.restarted(wide)
         return k + 1, ray, si_next, spread, ends, n_rough + dr.select(delta, 0, 1), open_, goes_on, sampler
 
-    ray = first_rays(sensor, sampler, n_paths, plan.world_share, places)
+    if plan.twins:
+        n_rays = (n_paths + 1) // 2
+        ray_lane, seed = dr.arange(mi.UInt32, n_rays), dr.gather(mi.UInt32, sampler.scramble, 0)
+        numbers = PathSampler.make(ray_lane, seed + 0x85EBCA6B, index=ray_lane, scramble=seed)
+        ray = dr.gather(mi.Ray3f, first_rays(sensor, numbers, n_rays, plan.world_share, places), lane // 2)
+    else:
+        ray = first_rays(sensor, sampler, n_paths, plan.world_share, places)
     si = scene.ray_intersect(ray)
     active = si.is_valid()
+    said = mi.Color3f(0) if first is None else first(si, si.bsdf(ray), is_smooth(si, active), sampler)
     spread = PathSpread.start(n_paths).arrive(si, ray, mi.Float(1), mi.Bool(True), is_smooth(si, active))
     state = (mi.UInt32(0), ray, si, spread, mi.UInt32(0), mi.Float(0), mi.Bool(active), mi.Bool(active), sampler)
     k_end, ray, si, _, _, n_rough, open_, _, sampler = dr.while_loop(
@@ -276,11 +308,13 @@ def trace_suffixes(
     end = S
 
     # ------------------------------ Back to front -----------------------------
-    dr.eval(E, N, f, end, k_end, records)
+    dr.eval(E, N, f, end, k_end, records, direction, rough, stops, said)
+    arrived = dr.zeros(mi.Color3f, size)
     S = mi.Color3f(0)
     for k in reversed(range(n_kept)):
         i = k * n_paths + lane
         S = dr.select(k_end == k + 1, end, S)
+        dr.scatter(arrived, S, i)
         weight = dr.gather(mi.Color3f, f, i)
         direct = dr.gather(mi.Color3f, N, i) + weight * dr.gather(mi.Color3f, E, i)
         reflected = weight * S
@@ -291,17 +325,25 @@ def trace_suffixes(
     n_bad = dr.count(records.valid & ~finite)
     records.valid &= finite
     records.target = dr.select(records.valid, records.target, 0)
-    return records, n_bad
+    finite = dr.all(dr.isfinite(arrived))
+    normal = dr.mulsign(records.surface.normal, dr.dot(records.surface.normal, direction))
+    arrived = dr.select(finite, arrived, 0)
+    incident = TrainingRecords(records.surface.position, direction, normal, arrived, rough & finite)
+    return records, n_bad, Bounces(N + f * E, f, incident, stops), said
 
 
-def packed(records: OutgoingRecords, n: int) -> OutgoingRecords:
+def packed(records, n: int):
     """The valid records in `n` places, in their order; what does not fit is left out, the rest holds nothing."""
     slot = dr.prefix_sum(dr.select(records.valid, mi.UInt32(1), mi.UInt32(0)))
     fits = records.valid & (slot < n)
-    out = _empty(n)
-    for to, value in zip(
-        (*out.surface.inputs(), out.target, out.valid), (*records.surface.inputs(), records.target, records.valid),
-        strict=True,
-    ):  # fmt: skip
-        dr.scatter(to, value, slot, fits)
+    out = _empty(n) if isinstance(records, OutgoingRecords) else empty_records(n)
+
+    def put(to, value):
+        if is_dataclass(to):
+            for field in fields(to):
+                put(getattr(to, field.name), getattr(value, field.name))
+        else:
+            dr.scatter(to, value, slot, fits)
+
+    put(out, records)
     return out

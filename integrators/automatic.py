@@ -1,0 +1,76 @@
+"""``termination="auto"``: at each vertex the outgoing cache, the incident cache or another bounce.
+
+What is measured for it, and how that decides: :mod:`mi_neural.caches.accuracy`.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.caches.blend import sigma_channels, where_active
+from mi_neural.caches.incident import reflect
+from mi_neural.integrators import prefix
+from mi_neural.transport.suffixes import surface_of
+
+#: For the class docstrings of the plugins that offer it.
+AUTO = """
+    With ``termination="auto"``, ``nirc`` and ``nrc`` are one and the same estimator: it has both caches, trained on the
+    same paths, and decides at each vertex by their errors, measured while training (no reference, no further rays).
+    Training paths start in twos from the same point, so that the mean of (A - T)(A - T') over pairs of independent
+    estimates is the squared bias of a cache's answer A, and (T - T')²/2 the noise v of tracing on, both by cells of
+    1/16 of the box. For an image of N samples a pixel:
+
+    - first vertex: the outgoing cache's answer with the weight :math:`v/N / (v/N + b_o^2)`, the mix of least squared
+      error; what is traced beside it ends right there in the incident cache if :math:`1.4 v_i/N + b_i^2 < v/N` (1.4:
+      its cost), else it goes on.
+    - later vertices, once the path is wide (``spread_threshold``): the outgoing cache with probability
+      :math:`1/(1 + N m^2/v)`, m being its mean error over a region; else as above, incident cache or another bounce.
+
+    So the first samples show the caches, more samples trust them less, and E[L_o] tends to the path-traced radiance.
+"""
+
+
+def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
+    """E[L] = Le + w L_o(x_1) + (1 - w) [direct light + what a path gathers that ends in either cache].
+
+    `field`: a :class:`~mi_neural.caches.pair.PairField`; None: path tracing. `n_samples`: of the pixel's finished
+    image. The first share w depends on nothing but the place, so E[L] is right wherever the two estimates are.
+    """
+    cached = integrator.needs_cache and field is not None
+
+    def stop(si, spread, smooth, first, sampler):
+        n = mi.Vector3f(si.sh_frame.n)
+        share, incident = field.accuracy.choose(si.p, n, n_samples, smooth)
+        wide = smooth & ~first & spread.exceeds(integrator.spread_threshold)
+        ends = wide & (sampler.next_1d() < field.accuracy.stops(si.p, n_samples, wide))
+        return share, ends, incident & (first | wide) & ~ends
+
+    path = prefix.trace(integrator, scene, lights, sampler, ray, active, stop if cached else None, look=cached)
+    depth, zero = dr.select(path.visible, mi.Float(path.depth), 0), mi.Color3f(0)
+    channels = {"traced": path.L, "cached": zero, "cache": zero, "density": mi.Float(0), "share": path.share,
+                "depth": depth, **sigma_channels(None, None, None)}  # fmt: skip
+    if not cached:
+        return path.L, path.visible, channels
+
+    def outgoing(*inputs):
+        return tuple(field.outgoing.query(*inputs))
+
+    shows = bool({"cache", "density"} & set(integrator.channels))
+    seen = (dr.max(path.β_first) > 0) & ((path.share > 0) | shows)
+    at_first = path.β_first * mi.Color3f(*where_active(seen, path.first.inputs(), outgoing, 3))
+    at_end = surface_of(path.si, path.si.bsdf(path.ray), path.ends, path.glossy)
+    at_end = mi.Color3f(*where_active(path.ends, at_end.inputs(), outgoing, 3))
+
+    lit = path.ends_lit
+    features = where_active(
+        lit, (mi.Point3f(path.si.p),), lambda x: tuple(field.incident.encode(x)), field.incident.shape.n_features_total
+    )
+    by_incident = reflect(
+        field.incident, list(features), path.si, path.si.bsdf(path.ray), integrator.cache.n_queries, sampler, lit
+    )
+    cached = path.share * at_first + path.β * (dr.select(path.ends, at_end, 0) + dr.select(lit, by_incident, 0))
+    channels |= {"cached": cached, "cache": at_first}
+    if shows:
+        channels["density"] = dr.select(seen, field.outgoing.density_at(path.first.position), 0)
+    return path.L + cached, path.visible, channels

@@ -1,0 +1,192 @@
+"""Both caches of one scene, trained on the same paths, and the measure of what either is worth.
+
+The radiance that a ray brings to one vertex is what the next vertex sends out: one training path gives a record to both
+caches at each bounce. Paths start in twos from the same point, so that errors can be measured (:mod:`.accuracy`).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.suffixes import scene_is_glossy
+from . import files
+from .accuracy import Accuracy, Pairs
+from .field import Field, FieldShape
+from .incident import Training, learn, reflect
+from .outgoing import OutgoingCache, OutgoingField, OutgoingShape, OutgoingTraining, fitted, training_paths
+
+#: Changes when a file written before cannot be read any more.
+FILE_VERSION = 1
+
+
+class PairField:
+    """An outgoing and an incident field, and their accuracy, with the protocol of either. A PyTree."""
+
+    DRJIT_STRUCT = {"outgoing": object, "incident": object, "accuracy": object}  # noqa: RUF012
+    #: The parts, in the order of files.
+    PARTS = ("outgoing", "incident", "accuracy")
+
+    def __init__(self, outgoing: OutgoingField, incident: Field, accuracy: Accuracy):
+        self.outgoing, self.incident, self.accuracy = outgoing, incident, accuracy
+
+    @property
+    def steps(self) -> int:
+        return self.outgoing.steps
+
+    @steps.setter
+    def steps(self, value: int) -> None:
+        self.outgoing.steps = self.incident.steps = value
+
+    @property
+    def shape(self) -> OutgoingShape:
+        return self.outgoing.shape
+
+    @property
+    def scale(self):
+        return self.outgoing.scale
+
+    @property
+    def box_min(self):
+        return self.outgoing.box_min
+
+    @property
+    def box_inv_extent(self):
+        return self.outgoing.box_inv_extent
+
+    def n_parameters(self) -> int:
+        return self.outgoing.n_parameters() + self.incident.n_parameters()
+
+    def reset(self) -> None:
+        """Start anew: all as it was when it was made, bit for bit."""
+        for name in self.PARTS:
+            getattr(self, name).reset()
+
+    def state(self) -> tuple:
+        """All that training changes, for :meth:`set_state`; the optimisers' moments are not in it."""
+        return self.outgoing.state(), self.incident.state(), self.accuracy.snapshot()
+
+    def set_state(self, state: tuple) -> None:
+        """Go back to what :meth:`state` gave."""
+        self.outgoing.set_state(state[0])
+        self.incident.set_state(state[1])
+        self.accuracy.restore(state[2])
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """All weights and measurements as NumPy arrays."""
+        return {f"{name}.{k}": v for name in self.PARTS for k, v in getattr(self, name).snapshot().items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go back to a :meth:`snapshot` of a pair of equal shape; the optimisers' moments start anew."""
+        for name in self.PARTS:
+            getattr(self, name).restore(_part(arrays, name))
+
+    def save(self, path, **facts) -> None:
+        """Write all of it and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
+        headers = {"outgoing": self.outgoing.header(), "incident": self.incident.header()}
+        files.write(path, {"kind": "pair", "version": FILE_VERSION, **headers, **facts}, self.snapshot())
+
+    @staticmethod
+    def of_parts(header: dict, arrays: dict[str, np.ndarray]) -> PairField:
+        """The pair of a file. Raises what impossible parts lead to."""
+        outgoing = OutgoingField.of_parts(header["outgoing"], _part(arrays, "outgoing"))
+        incident = Field.of_parts(header["incident"], _part(arrays, "incident"))
+        accuracy = Accuracy(*outgoing.box, scale=float(outgoing.scale[0]))
+        files.check_arrays(_part(arrays, "accuracy"), accuracy.snapshot())
+        accuracy.restore(_part(arrays, "accuracy"))
+        return PairField(outgoing, incident, accuracy)
+
+    @staticmethod
+    def load(path) -> tuple[PairField, dict]:
+        """The pair of a file, and its header; errors as of :func:`.files.read`."""
+        return files.read(path, FILE_VERSION, "pair", PairField.of_parts)
+
+
+def _part(arrays: dict, name: str) -> dict:
+    return {k.removeprefix(f"{name}."): v for k, v in arrays.items() if k.startswith(f"{name}.")}
+
+
+class PairCache(OutgoingCache):
+    """Both fields together with their training. In all but what it learns an `OutgoingCache`.
+
+    `training`, `incident_training`: of the two fields; `sizes`: of both. `n_queries`: how often the incident field is
+    asked at the end of a path.
+    """
+
+    FIELD = PairField
+
+    def __init__(
+        self, training: OutgoingTraining, incident_training: Training, sizes: FieldShape | None = None, seed: int = 0,
+        *, n_queries: int = 4,
+    ):  # fmt: skip
+        sizes = sizes or FieldShape()
+        super().__init__(training, OutgoingShape.like(sizes), seed)
+        self.incident_training, self.incident_shape, self.n_queries = incident_training, sizes, n_queries
+
+    def measured(self) -> dict:
+        return {} if self.field is None else self.field.accuracy.summary()
+
+    def start(self, scene, sensor, lights=None) -> None:
+        super().start(scene, sensor, lights)
+        outgoing = self.field
+        scale = float(outgoing.scale[0])
+        incident = Field(*outgoing.box, self.incident_shape, scale=scale, seed=self.seed + 1)
+        self.field = PairField(outgoing, incident, Accuracy(*outgoing.box, scale=scale))
+        dr.eval(self.field)
+
+    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
+        outgoing, incident = field.outgoing, field.incident
+
+        def ask(si, bsdf, active, sampler):
+            features = incident.encode(si.p)
+            return reflect(incident, features, si, bsdf, self.n_queries, sampler, active)
+
+        with dr.suspend_grad():
+            records, n_bad, bounces, said = training_paths(
+                scene, sensor, outgoing, self.training, seed, lights, scene_is_glossy(scene), twins=True, first=ask
+            )
+            n_valid = dr.count(records.valid)
+            dr.eval(records, n_bad, n_valid, bounces, said)
+            pairs = pairs_of(records, bounces, said, outgoing, self.training.n_paths)
+            arrived = fitted(bounces.incident, self.training)
+            records = fitted(records, self.training)
+            self.note(outgoing, records, seed, decay)
+            said = outgoing.query(*records.surface.inputs())
+            dr.eval(pairs, arrived, records, said)
+            field.accuracy.observe(pairs, records.surface.position, records.target, said, records.valid, decay)
+        value, mean_target, mean_prediction, more = outgoing.learn(
+            *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon
+        )
+        value_i, mean_target_i, mean_prediction_i = learn(
+            incident, arrived, self.incident_training, seed + 0x3C6EF372, learning_rate, decay
+        )
+        value = dr.select(n_valid > 0, value + value_i, 0)  # nothing to learn is no divergence
+        mean_prediction = dr.maximum(mean_prediction, mean_prediction_i)
+        return value, dr.maximum(mean_target, mean_target_i), mean_prediction, n_valid, n_bad + more, mi.Float(0)
+
+
+def pairs_of(records, bounces, said, outgoing: OutgoingField, n_paths: int) -> Pairs:
+    """The first vertices of twin paths: both estimates of each, by one more bounce and by the incident cache.
+
+    One more bounce is what a pixel's path does: it ends at the second vertex in the outgoing cache, if it may end
+    there; else it goes on, as the training path did.
+    """
+    lane = dr.arange(mi.UInt32, n_paths)
+    n_records = dr.width(records.valid)
+    second = dr.minimum(lane + n_paths, n_records - 1)
+    ends = dr.gather(mi.Bool, bounces.stops, lane) & dr.gather(mi.Bool, records.valid, second)
+    ends &= lane + n_paths < n_records
+    surface = dr.gather(type(records.surface), records.surface, second)
+    beyond = dr.select(ends, outgoing.query(*surface.inputs()), dr.gather(mi.Color3f, bounces.incident.target, lane))
+    bounce = dr.gather(mi.Color3f, bounces.weight, lane) * beyond
+    direct = dr.gather(mi.Color3f, bounces.direct, lane)
+    dr.eval(bounce, direct)
+
+    k = dr.arange(mi.UInt32, n_paths // 2) * 2
+    surface = dr.gather(type(records.surface), records.surface, k)
+    twins = [(dr.gather(mi.Color3f, v, k), dr.gather(mi.Color3f, v, k + 1)) for v in (direct, bounce, said)]
+    valid = dr.gather(mi.Bool, records.valid, k) & dr.gather(mi.Bool, records.valid, k + 1)
+    for v in twins:
+        valid &= dr.all(dr.isfinite(v[0] + v[1]))
+    return Pairs(surface.position, surface.normal, outgoing.query(*surface.inputs()), *twins, valid)
