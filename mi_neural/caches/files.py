@@ -12,11 +12,12 @@ import numpy as np
 
 #: Changes when a file written before cannot be read any more.
 FILE_VERSION = 2
-#: What files of some kind hold.
+#: What is said of a file that is not of the kind asked for.
 KINDS = {
-    "incident": "incident radiance alone", "outgoing": "outgoing radiance",
-    "pair": "incident and outgoing radiance together, as termination='auto' needs them",
-}  # fmt: skip
+    "incident": "holds no incident radiance alone; train an incident cache and save it",
+    "outgoing": "holds no outgoing radiance; train an outgoing cache and save it",
+    "pair": "does not hold both incident and outgoing radiance; train and save a cache with termination='auto'",
+}
 #: Largest size of all arrays together, in bytes: a damaged or hostile file must not fill the memory.
 LARGEST = 2**31
 
@@ -72,9 +73,7 @@ def read(path, kind: str, unknown: tuple[str, ...] = ()) -> tuple[dict, dict[str
             f"'{path}' has cache format {version}, this version reads {FILE_VERSION}; train and save it again"
         )
     if found != kind:
-        raise CacheFileError(
-            f"'{path}' holds no {KINDS[kind]} but {KINDS.get(found, 'something else')}; train such a cache and save it"
-        )
+        raise CacheFileError(f"'{path}' {KINDS[kind]}")
     if {name: list(values.shape) for name, values in arrays.items()} != header.get("arrays"):
         raise damaged(path, "its arrays are not those that its header says")
     for name, values in arrays.items():
