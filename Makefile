@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/mi_neural.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture test lint clean
+.PHONY: help demo picture test stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -34,6 +34,9 @@ picture: demo  ## the README's picture, of the demo's frames
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(STAMP)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+stress: $(STAMP)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
+	$(BIN)/python tests/stress.py -o out/stress
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

@@ -2,6 +2,17 @@
 
 from __future__ import annotations
 
+import os
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Most entries of an array: Dr.Jit counts them in 32 bits.
+MOST_ENTRIES = 2**32 - 1
+#: Numbers of a pixel while an image is made: colour, alpha, weight, and copies of them.
+FILM_VALUES = 16
+
 
 def check_scene(scene, plugin: str) -> None:
     """Refuse, before any work, a scene that cannot be rendered; the message says what to do."""
@@ -21,6 +32,59 @@ def check_scene(scene, plugin: str) -> None:
                 f"{plugin}: shape '{shape.id()}' borders a participating medium, which the cache does not model; "
                 'use <integrator type="volpath"/>'
             )
+    for emitter in scene.emitters():
+        _check_emitter(emitter, plugin)
+
+
+def _check_emitter(emitter, plugin: str) -> None:
+    """Refuse a light that is not finite: no choice of lights has a probability then, and every pixel is lost."""
+    shape = emitter.get_shape()
+    parts = [(f"emitter '{emitter.id()}'", mi.traverse(emitter), "")]
+    if shape is not None and shape.is_mesh():
+        parts.append((f"the mesh '{shape.id()}', which shines,", mi.traverse(shape), "vertex_positions"))
+    for name, parameters, only in parts:
+        for key in parameters.keys():
+            if only and key != only:
+                continue
+            value = parameters[key]
+            if dr.is_array_v(value) and dr.is_float_v(value) and not np.isfinite(np.array(value)).all():
+                raise ValueError(
+                    f"{plugin}: {name} has values that are not finite in '{key}'; "
+                    f"mend them, for example mi.traverse(scene) ... ['{key}'] = 0"
+                )
+
+
+def check_film(sensor, plugin: str, bytes_per_pixel: int = 4 * FILM_VALUES) -> None:
+    """Refuse, before memory is asked for, a film that does not fit Dr.Jit's arrays or the memory that is free.
+
+    `bytes_per_pixel`: what is held at once of each pixel at one sample a pixel.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    advice = "render it in crop windows (crop_offset_x, crop_width, ... of the film), or make it smaller"
+    if width * height * FILM_VALUES > MOST_ENTRIES:
+        raise ValueError(f"{plugin}: a film of {width}x{height} exceeds the 2^32 entries of an array; {advice}")
+    needed, free = width * height * bytes_per_pixel, _free_memory()
+    if free is not None and needed > free:
+        raise ValueError(
+            f"{plugin}: a film of {width}x{height} takes about {needed / 2**30:.1f} GiB at one sample a pixel, "
+            f"{free / 2**30:.1f} GiB are free; {advice}"
+        )
+
+
+def _free_memory() -> int | None:
+    """Bytes of main memory that are free; None where that is unknown, or where rendering is done elsewhere."""
+    if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
+        return None
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            found = dict(line.split(":", 1) for line in file)
+        return int(found["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return None
 
 
 def sensor_of(scene, sensor, plugin: str):

@@ -12,9 +12,10 @@ import numpy as np
 
 from mi_neural.caches.blend import BLENDS
 from mi_neural.caches.field import CacheFileError, FieldShape
+from mi_neural.caches.files import damaged
 from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.caches.reliability import MEASURES, Reliability
-from mi_neural.integrators.checks import check_scene, sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, sensor_of
 from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, light_sampler_of
 from mi_neural.transport.freezing import undisturbed
 from mi_neural.transport.identity import SceneWatch
@@ -299,6 +300,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         self.state.signature = signature
         if is_another:
             self.state.passes.clear()  # recordings of the other scene
+            self.cache.clear_recordings()
             self.state.facts = {}
 
     def _train_first(self, scene, sensor, progress=None) -> None:
@@ -434,7 +436,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Write the trained cache to `path`, whole or not at all."""
         if self.cache.field is None:
             raise RuntimeError(f"{self.plugin}: there is no cache to save yet; render an image or call train() first")
-        self.cache.field.save(
+        self.cache.save(
             path, scene=self.state.signature, statistics=dict(self.cache.statistics), **self.file_facts()
         )
 
@@ -443,7 +445,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
 
         Raises `CacheFileError` (a ``ValueError``).
         """
-        field, header = self.cache.FIELD.load(path)
+        field, header, extra = self.cache.read(path)
         if field.shape != self.cache.shape:
             raise CacheFileError(f"'{path}' holds a cache of {field.shape}, this integrator has {self.cache.shape}; "
                                  "give it the same sizes")  # fmt: skip
@@ -453,7 +455,10 @@ class CacheIntegrator(mi.SamplingIntegrator):
         known = self.state.signature
         if known is not None and header.get("scene") != known:
             raise CacheFileError(_other_scene(path))
-        self.cache.adopt(field)
+        try:
+            self.cache.resume(field, header, extra)
+        except (KeyError, TypeError, ValueError) as e:
+            raise damaged(path, e) from None
         self.state.loaded = (path, header.get("scene"))
 
     # -------------------------------------------------------------------------------------------------------------
@@ -466,6 +471,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
         sensor = self._sensor(scene, sensor)
         self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
+        check_film(sensor, self.plugin)
         spp = spp or sensor.sampler().sample_count()
         with dr.suspend_grad():
             self._ready(scene, sensor)

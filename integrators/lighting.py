@@ -6,10 +6,16 @@ import weakref
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mi_neural.integrators.checks import sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, sensor_of
 from mi_neural.transport.freezing import can_freeze, undisturbed
 from mi_neural.transport.identity import SceneWatch
+
+#: Most camera samples traced at once: what Ctrl-C has to wait for, some seconds.
+PASS_SAMPLES = 2**22
+#: What a camera sample takes in memory, the film's copies with it (measured on two cores: 22 to 29 bytes).
+SAMPLE_BYTES = 64
 
 LIGHT_SAMPLER_KEY = """
      * - light_sampler
@@ -35,6 +41,7 @@ class _Images:
 
     def __init__(self):
         self.scene, self.frozen, self.sensors = SceneWatch(), {}, {}
+        self.stopped = False  # by a Ctrl-C that Mitsuba's own render() took
 
 
 class LightSamplingIntegrator(mi.SamplingIntegrator):
@@ -45,8 +52,8 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
     takes longer than a sample a pixel.
     """
 
-    #: Whether images may be rendered by frozen functions.
-    freezes = True
+    #: Whether images may be rendered by frozen functions, and with gradients.
+    freezes = differentiable = True
 
     def __init__(self, props):
         super().__init__(props)
@@ -54,55 +61,76 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         self.light_sampler = light_sampler_of(props)
         self.lights, self.entered = None, False
         self.images = _Images()
+        self.met = SceneWatch()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         sensor = sensor_of(scene, sensor, self.plugin)
         if self.entered:  # Mitsuba's own render() comes back here once
             return super().render(scene, sensor, seed, spp, develop, evaluate)
+        if spp < 0:
+            raise ValueError(f"{self.plugin}: spp is {spp}; give 0 (the sampler's own count) or more")
+        check_film(sensor, self.plugin, SAMPLE_BYTES)
         self.entered = True
         try:
-            self.prepare_lights(scene, sensor)
-            frozen = None if not self.freezes or _differentiates() else self._frozen_image(scene, sensor, spp)
-            if frozen is None:
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
-            return self._replay(frozen, scene, sensor, seed, spp, develop, evaluate)
+            if self.differentiable and _differentiates():
+                self.prepare_lights(scene, sensor)
+                image = super().render(scene, sensor, seed, spp, develop, evaluate)
+                if self.should_stop():  # Ctrl-C, which Mitsuba takes in its own render() and may keep to itself
+                    raise KeyboardInterrupt
+                return image
+            with dr.suspend_grad():
+                self.prepare_lights(scene, sensor)
+                return self._render(scene, sensor, seed, spp or sensor.sampler().sample_count(), develop, evaluate)
         finally:
             self.entered = False
 
-    def _frozen_image(self, scene, sensor, spp: int):
-        """A frozen function that renders `spp` samples a pixel and gives the film's raw content; None if `sensor` does
-        not let it be frozen."""
-        if self.images.scene.changed(scene):
-            self.images.frozen.clear()
-            self.images.sensors.clear()
-        if id(sensor) not in self.images.sensors:
-            self.images.sensors[id(sensor)] = sensor, can_freeze(sensor)  # held, so that no other has its id
-        if not self.images.sensors[id(sensor)][1]:
-            return None
-        film = sensor.film()
-        keys = tuple((k, v) for k, v in vars(self).items() if isinstance(v, (int, float, str)))
-        key = (id(sensor), *film.crop_size(), *film.crop_offset(), spp or sensor.sampler().sample_count(), keys)
-        if key not in self.images.frozen:
-            # Held weakly: an attribute that changes would have it recorded anew
-            self.images.frozen[key] = dr.freeze(_image_of(weakref.ref(self), spp), auto_opaque=False)
-        return self.images.frozen[key]
-
-    def _replay(self, frozen, scene, sensor, seed, spp, develop, evaluate):
+    def _render(self, scene, sensor, seed, spp: int, develop: bool, evaluate: bool):
+        """An image without gradients, in passes that fit memory."""
         film, sampler = sensor.film(), sensor.sampler()
-        if spp:
-            sampler.set_sample_count(spp)
-        # Their state is an argument as well
+        first = int(mi.UInt32(seed)[0])
+        size, total = max(1, PASS_SAMPLES // (int(film.crop_size()[0]) * int(film.crop_size()[1]))), None
+        for k, done in enumerate(range(0, spp, size)):
+            n = min(size, spp - done)
+            image = self._image(scene, sensor, n)
+            sampler.set_sample_count(n)
+            # Their state is an argument as well
+            film.prepare(self.aov_names())
+            sampler.seed(0, 1)
+            number = first if k == 0 else int(np.random.SeedSequence((first, k)).generate_state(1)[0])
+            with undisturbed():
+                raw = image(scene, sensor, self.lights, dr.opaque(mi.UInt32, number))
+            if self.images.stopped:
+                self.images.stopped = False
+                raise KeyboardInterrupt
+            total = raw if total is None else total + raw
+            dr.eval(total)
+        sampler.set_sample_count(spp)
         film.prepare(self.aov_names())
-        sampler.seed(0, 1)
-        with undisturbed():
-            raw = frozen(scene, sensor, self.lights, dr.opaque(mi.UInt32, int(mi.UInt32(seed)[0])))
-        film.prepare(self.aov_names())
-        film.put_block(mi.ImageBlock(raw, film.crop_offset(), film.rfilter()))
+        film.put_block(mi.ImageBlock(total, film.crop_offset(), film.rfilter()))
         sampler.seed(0, 1)
         result = film.develop() if develop else mi.TensorXf()
         if evaluate:
             dr.eval(result)
         return result
+
+    def _image(self, scene, sensor, spp: int):
+        """A function that renders `spp` samples a pixel and gives the film's raw content; frozen, if `sensor` lets it
+        be."""
+        if self.images.scene.changed(scene):
+            self.images.frozen.clear()
+            self.images.sensors.clear()
+        if id(sensor) not in self.images.sensors:
+            self.images.sensors[id(sensor)] = sensor, can_freeze(sensor)  # held, so that no other has its id
+        # Held weakly: an attribute that changes would have it recorded anew
+        image = _image_of(weakref.ref(self), spp)
+        if not (self.freezes and self.images.sensors[id(sensor)][1]):
+            return image
+        film = sensor.film()
+        keys = tuple((k, v) for k, v in vars(self).items() if isinstance(v, (int, float, str)))
+        key = (id(sensor), *film.crop_size(), *film.crop_offset(), spp, keys)
+        if key not in self.images.frozen:
+            self.images.frozen[key] = dr.freeze(image, auto_opaque=False)
+        return self.images.frozen[key]
 
     def ready(self, scene) -> None:
         """Have lights chosen also where another integrator (``aov``) asks for samples and no image is rendered."""
@@ -110,7 +138,10 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
             self.prepare_lights(scene, scene.sensors()[0])
 
     def prepare_lights(self, scene, sensor, train: bool = True) -> None:
-        """Have lights chosen as they are in `scene` now; one frame of training."""
+        """Have lights chosen as they are in `scene` now; one frame of training. Refuses what cannot be rendered."""
+        if not self.met.knows(scene):
+            check_scene(scene, self.plugin)
+            self.met.changed(scene)
         if self.light_sampler is not None:
             self.lights = self.light_sampler.lights(scene, sensor, train)
 
@@ -161,6 +192,7 @@ def _image_of(integrator, spp: int):
         known, it.lights = it.lights, lights
         try:
             mi.SamplingIntegrator.render(it, scene, sensor, seed, spp, False, False)
+            it.images.stopped |= it.should_stop()
         finally:
             it.lights = known
         raw = sensor.film().develop(raw=True)

@@ -39,7 +39,8 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         self._check(self.mode in MODES, f"mode is '{self.mode}'; give one of: {', '.join(MODES)}")
         self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; the two-level estimator needs 'ema'")
         if self.ris:
-            self._check(given["residual_samples"] in (None, 1), "ris chooses one direction; leave residual_samples at 1")
+            self._check(given["residual_samples"] in (None, 1),
+                        "ris chooses one direction; leave residual_samples at 1")  # fmt: skip
             given["residual_samples"] = 1
         try:
             self.choice = pilot.Choice(**given)

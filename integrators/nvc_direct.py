@@ -7,8 +7,8 @@ import mitsuba as mi
 
 from mi_neural.caches.direct import DirectCache, DirectTraining, albedo
 from mi_neural.caches.visibility import VisibilityCache
-from mi_neural.integrators.checks import check_scene, sensor_of
-from mi_neural.integrators.lighting import light_sampler_of
+from mi_neural.integrators.checks import check_scene
+from mi_neural.integrators.lighting import LightSamplingIntegrator, light_sampler_of
 from mi_neural.lights import clusters
 from mi_neural.lights.sampling import VisibleLights
 from mi_neural.lights.table import LightTable
@@ -24,7 +24,7 @@ CHANNELS = ("visibility", "light", "pmf")
 RR_DEPTH = 8
 
 
-class NVCDirectIntegrator(mi.SamplingIntegrator):
+class NVCDirectIntegrator(LightSamplingIntegrator):
     r"""
     .. _integrator-nvc_direct:
 
@@ -111,9 +111,10 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
             mi.load_dict({"type": "nvc_direct", "mode": "neural"})
     """
 
+    freezes = differentiable = False
+
     def __init__(self, props):
         super().__init__(props)
-        self.plugin = props.plugin_name()
         self.mode = props.get("mode", "sampled")
         self.kind = props.get("cache", "visibility")
         self.light_samples = props.get("light_samples", 1)
@@ -139,7 +140,6 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
         self.depth_limit = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
         trace = partial(direct_records, self.depth_limit)
         self.cache = DirectCache(trace, DirectTraining(self.train_samples), self.seed)
-        self.entered = False
         self.reset()
 
     def _check(self, ok: bool, message: str) -> None:
@@ -224,18 +224,6 @@ class NVCDirectIntegrator(mi.SamplingIntegrator):
 
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
-
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        sensor = sensor_of(scene, sensor, self.plugin)
-        if self.entered:  # Mitsuba's own render() comes back here once
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
-        self.entered = True
-        try:
-            self.prepare_lights(scene, sensor)
-            with dr.suspend_grad():
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
-        finally:
-            self.entered = False
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         if not self.entered and not self.watch.knows(scene):  # inside another integrator

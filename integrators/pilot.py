@@ -121,7 +121,8 @@ class Choice:
         if self.measured_at >= 0 and steps < 2 * max(self.measured_at, 1):
             return
         start = time.perf_counter()
-        if self.may_ask and integrator.cache.statistics.get("alpha") is None and self.given["alpha"] in (None, BY_PLACE):
+        by_place = self.may_ask and self.given["alpha"] in (None, BY_PLACE)
+        if by_place and integrator.cache.statistics.get("alpha") is None:  # a cache that was trained elsewhere
             integrator.cache.look(scene, sensor, integrator.state.lights, LOOK_FRAMES)
         self.measured_at = steps
         if not self.fixed:

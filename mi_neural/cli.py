@@ -2,7 +2,7 @@
 installed.
 
 Progress goes to stderr and results to stdout. Exit codes: 0 done, 2 the input cannot be used (one line says why),
-130 interrupted, with what was rendered so far on disk.
+130 (Ctrl-C) and 143 (SIGTERM) interrupted, with what was rendered so far on disk.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from mi_neural.measure import benchmark, budget, changes, denoise, environment, exr, load, plots, report, terminal
+from mi_neural.measure import benchmark, budget, changes, denoise, environment, exr, kept, load, plots, report, terminal
 from mi_neural.measure import reference as references
 from mi_neural.measure import sequence as sequences
 from mi_neural.measure.load import InputError
@@ -36,7 +36,6 @@ DEFAULT_FRAME_SECONDS = "0.25,1"
 DEFAULT_REFERENCE_SPP = 1024
 DEFAULT_FRAMES = 60
 DEFAULT_SEQUENCE_REFERENCE_SPP = 256
-INTERRUPTED = 130
 
 # ------------------------------------------------------------------------------------------------------------------
 # Options shared by the commands
@@ -67,7 +66,7 @@ def readable(command: Callable) -> Callable:
             return command(*args, **kwargs)
         except KeyboardInterrupt as error:
             terminal.err.print(str(error) or "interrupted", soft_wrap=True, markup=False)
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(128 + terminal.stopped_by()) from None
         except (ValueError, OSError, ImportError, RuntimeError) as error:
             if os.environ.get("MI_NEURAL_TRACEBACK"):
                 raise
@@ -109,7 +108,7 @@ def render(
     load_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="start from what was learned")] = None,
     json_: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="write the facts")] = None,
 ) -> None:
-    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far."""
+    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute."""
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")
     terminal.positive("--spp", spp)
@@ -144,6 +143,21 @@ def render(
     terminal.depth_notes(ref, loaded, [case])
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
+    seconds_pretrain = 0.0
+
+    def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
+        row = benchmark.make_row(
+            loaded, case, "one-shot" if seconds is not None else "spp", [rendered], [image], seed,
+            denoised=denoise_ and image is not rendered.rgb, seconds_denoise=seconds_denoise,
+            environment=environment.describe(), budget_seconds=seconds, pretrain_frames=pretrain,
+            seconds_pretrain=seconds_pretrain,
+        )  # fmt: skip
+        row.image = str(output)
+        return row
+
+    def keep(so_far: budget.Rendered) -> None:
+        terminal.write_image(output, describe(so_far, so_far.rgb), so_far.rgb, so_far)
+
     with terminal.Bars() as bars:
         if denoise_:
             bars("guides for the denoiser")
@@ -174,31 +188,18 @@ def render(
                 seed,
                 progress=bars(f"rendering for {seconds:g} s"),
                 pretrained=bool(pretrain or load_cache),
+                keep=keep,
             )
         else:
             rendered = budget.render_samples(
-                loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel")
+                loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
             )
         rendered.seconds_train += seconds_first
         image, seconds_denoise = rendered.rgb, 0.0
         if denoise_:
             image, seconds_denoise = denoise.denoise(rendered.rgb, guides)
 
-    row = benchmark.make_row(
-        loaded,
-        case,
-        "one-shot" if seconds is not None else "spp",
-        [rendered],
-        [image],
-        seed,
-        denoised=denoise_,
-        seconds_denoise=seconds_denoise,
-        environment=environment.describe(),
-        budget_seconds=seconds,
-        pretrain_frames=pretrain,
-        seconds_pretrain=seconds_pretrain,
-    )
-    row.image = str(output)
+    row = describe(rendered, image, seconds_denoise)
     terminal.write_image(output, row, image, rendered)
     if ref is not None:
         benchmark.judge(row, [image], ref)
@@ -242,7 +243,10 @@ def compare(
     denoise_: Denoise = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
 ) -> None:
-    """Integrators on SCENE at equal time: report.html, table.md, results.json, images. Ctrl-C keeps what is done."""
+    """Integrators on SCENE at equal time: report.html, table.md, results.json, images. Ctrl-C keeps what is done.
+
+    The same command goes on from there.
+    """
     if output is None:
         raise InputError("compare needs a folder for its results: add -o DIR")
     if reference is not None and reference_spp is not None:
@@ -282,9 +286,11 @@ def compare(
 
     def keep(picture: benchmark.Picture) -> None:
         row = picture.row
-        row.image = terminal.slug(row) + ".exr"
-        terminal.write_image(output / row.image, row, picture.rgb, picture.rendered)
-        exr.write_png(output / (terminal.slug(row) + ".png"), picture.rgb, exposure)
+        if picture.rendered is not None:
+            row.image = terminal.slug(row) + ".exr"
+            terminal.write_image(output / row.image, row, picture.rgb, picture.rendered)
+            exr.write_png(output / (terminal.slug(row) + ".png"), picture.rgb, exposure)
+            done.add(row)
         pictures.append(picture)
 
     interrupted = False
@@ -298,27 +304,32 @@ def compare(
         notes = terminal.depth_notes(ref, loaded, cases) + terminal.notes(ref, denoise_)
         exposure = exr.automatic_exposure(ref.rgb)
         exr.write_png(output / "reference.png", ref.rgb, exposure)
+        done = kept.Kept(output, kept.settings_of(loaded, cases, plan, ref, denoise_))
+        if done.rows:
+            terminal.announce(f"{len(done.rows)} rows are there already, of the same command interrupted")
         try:
             bars("guides for the denoiser" if denoise_ else "starting")
             guides = denoise.render_guides(loaded.scene, seed) if denoise_ else None
             if guides:
                 notes.append(f"The guides took {guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp), counted for nobody.")
-            bench = benchmark.Bench(loaded, ref, guides, environment.describe(), keep, bars)
+            bench = benchmark.Bench(loaded, ref, guides, environment.describe(), keep, bars, done)
             bench.run(cases, plan)
         except KeyboardInterrupt:
             interrupted = True
-            notes.insert(0, "Interrupted: not all rows are there.")
+            notes.insert(0, "Interrupted: not all rows are there. The same command goes on from here.")
 
     rows = [p.row for p in pictures]
     command = shlex.join(["mi-neural", *sys.argv[1:]])
     found = report.Report(loaded.name, loaded.size, command, environment.describe(), rows, pictures, ref, notes)
     report.write(found, output)
+    if not interrupted:
+        done.finish()
     terminal.print_rows(rows)
     for note in notes:
         terminal.out.print(note, soft_wrap=True, markup=False)
     terminal.out.print(f"wrote {output / 'report.html'}", soft_wrap=True, markup=False)
     if interrupted:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt("interrupted: the same command goes on from here")
 
 
 CHANGE_HELP = """a parameter of mi.traverse(scene), or the end of its name, as an expression of value (the original
@@ -464,6 +475,7 @@ def info() -> None:
 
 def main() -> None:
     """Entry point of the program."""
+    terminal.stop_alike()
     app()
 
 

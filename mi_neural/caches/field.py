@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 
 import drjit as dr
 import drjit.nn as nn
@@ -11,10 +12,13 @@ import numpy as np
 from drjit.opt import Adam
 
 from . import encoding, files
-from .files import CacheFileError as CacheFileError
+from .files import FILE_VERSION, CacheFileError
 
-#: Changes when a file written before cannot be read any more.
-FILE_VERSION = 1
+__all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedField", "Weights"]
+
+#: Largest sizes of a field: beyond, a slip of the pen or a damaged file fills the memory.
+LARGEST = {"n_levels": 32, "n_features": 16, "hashmap_size": 2**24, "base_resolution": 2**12, "width": 1024,
+           "n_hidden": 32, "n_outputs": 1024}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -43,11 +47,11 @@ class FieldShape:
     leak: float = 0.0
 
     def __post_init__(self):
-        for name in ("n_levels", "n_features", "hashmap_size", "base_resolution", "width", "n_hidden", "n_outputs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if self.per_level_scale <= 1:
-            raise ValueError(f"per_level_scale is {self.per_level_scale}; it must be greater than 1")
+        for name, most in LARGEST.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1..{most}")
+        if not 1 < self.per_level_scale <= 16:
+            raise ValueError(f"per_level_scale is {self.per_level_scale}; it must be greater than 1 and at most 16")
         if not -1 <= self.direction_degree <= 7:
             raise ValueError(f"direction_degree is {self.direction_degree}; it must lie in -1..7")
         if self.hashmap_size % self.n_features:
@@ -98,6 +102,25 @@ def descend(optimizer: Adam, loss, averaged: dict, learning_rate, decay) -> dict
     averaged = {k: dr.lerp(dr.detach(optimizer[k]), v, decay) for k, v in averaged.items()}
     dr.eval(optimizer, averaged)
     return averaged
+
+
+def moments_of(optimizer: Adam) -> dict[str, np.ndarray]:
+    """What an optimiser of :func:`attach_adam` remembers of the steps so far, by names made of its parameters'."""
+    arrays = {}
+    for key, (_, _, _, (t, first, second, _)) in optimizer.state.items():
+        arrays |= {f"adam_steps.{key}": np.array(t), f"first.{key}": np.array(first), f"second.{key}": np.array(second)}
+    return arrays
+
+
+def set_moments(optimizer: Adam, arrays: dict[str, np.ndarray]) -> None:
+    """Go on from :func:`moments_of`. Raises ``KeyError`` or ``ValueError`` where something is missing or too long."""
+    for key, (value, promoted, lr, (t, *moments, largest)) in optimizer.state.items():
+        given = [arrays[f"{name}.{key}"] for name in ("first", "second")]
+        steps = int(arrays[f"adam_steps.{key}"].item())
+        if steps < 0 or any(a.shape != m.shape for a, m in zip(given, moments, strict=True)):
+            raise ValueError(f"the optimiser's moments of {key} do not have the size of its parameters")
+        taken = [own_copy(type(m)(np.float32(a))) for a, m in zip(given, moments, strict=True)]
+        optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), steps), *taken, largest)
 
 
 class Weights:
@@ -163,7 +186,151 @@ class Weights:
         return [mi.Float(o) for o in self.packed(nn.CoopVec(*inputs))]
 
 
-class Field:
+class TrainedField:
+    """Base of the learned functions: weights being trained, in an optimiser, and their average; copies and files of
+    both. Subclasses give `KIND`, `make` and the like, see there.
+    """
+
+    #: What such a field holds, in the words of file headers and messages.
+    KIND = ""
+    #: Arrays beside the weights that training changes, as paths of attributes; those of `UNKNOWN` may hold NaN.
+    BESIDE: tuple[str, ...] = ()
+    UNKNOWN: tuple[str, ...] = ()
+
+    shape: FieldShape
+    current: Weights
+    averaged: Weights
+
+    def _attach_optimizer(self) -> None:
+        self.optimizer = attach_adam(self.current.parameters())
+        self.averaged.assign({k: own_copy(v) for k, v in self.averaged.parameters().items()})
+        self.averaged.pack()
+        dr.eval(self.optimizer, self.averaged)
+
+    def sync(self) -> None:
+        """Bring `current` up to date with training, for queries with ``averaged=False``; a frozen function that makes
+        such queries calls it itself, before them."""
+        self.current.assign({k: dr.detach(v) for k, v in self.optimizer.items()})
+        self.current.order = self.averaged.order  # the same, but known to frozen functions
+        self.current.pack()
+
+    def optimizers(self) -> list:
+        """The optimisers that hold the weights being trained."""
+        return [self.optimizer]
+
+    def n_parameters(self) -> int:
+        """Number of trained numbers."""
+        return sum(int(np.prod(v.shape)) for v in self.averaged.parameters().values())
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """All weights as NumPy arrays."""
+        self.sync()
+        return {
+            f"{name}.{k}": np.array(dr.detach(v))
+            for name in ("current", "averaged")
+            for k, v in getattr(self, name).parameters().items()
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Weights from :meth:`snapshot` of a field of equal shape; the optimiser's moments start anew."""
+        for name in ("current", "averaged"):
+            weights = getattr(self, name)
+            weights.assign({k: own_copy(type(v)(arrays[f"{name}.{k}"])) for k, v in weights.parameters().items()})
+            weights.pack()
+        self._attach_optimizer()
+
+    # -------------------------------------------------------------------------------------------------------------
+    # To be given by subclasses, beside `reset`
+
+    def constants(self) -> dict:
+        """JSON values that :meth:`make` makes such a field of."""
+        raise NotImplementedError(f"{type(self).__name__} must define constants()")
+
+    @classmethod
+    def make(cls, constants: dict):
+        """A field as `constants` describe it. Raises any exception for such that make no sense."""
+        raise NotImplementedError(f"{cls.__name__} must define make()")
+
+    def scalars(self) -> dict:
+        """Numbers beside the arrays of :meth:`arrays` that training changes."""
+        return {"steps": self.steps}
+
+    def set_scalars(self, given: dict) -> None:
+        """Go on from :meth:`scalars`. Raises any exception for numbers that make no sense."""
+        steps = given["steps"]
+        if not (isinstance(steps, int) and steps >= 0):
+            raise ValueError(f"it says that {steps} steps were made")
+        self.steps = steps
+
+    # -------------------------------------------------------------------------------------------------------------
+    # All that training changes
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays that training changes: :meth:`snapshot`, the optimiser's moments, and what is beside."""
+        beside = {f"beside.{name}": np.array(attrgetter(name)(self)) for name in self.BESIDE}
+        return self.snapshot() | moments_of(self.optimizer) | beside
+
+    def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from :meth:`arrays` of a field of equal shape as if nothing had been in between.
+
+        Raises ``KeyError`` or ``ValueError`` where something is missing or has another size.
+        """
+        expected = {k: v.shape for k, v in self.snapshot().items()}
+        if {k: v.shape for k, v in arrays.items() if k in expected} != expected:
+            raise ValueError("its weights do not have the sizes that its header says")
+        self.restore(arrays)
+        set_moments(self.optimizer, arrays)
+        for name in self.BESIDE:
+            path, _, attribute = name.rpartition(".")
+            owner = attrgetter(path)(self) if path else self
+            value, given = getattr(owner, attribute), arrays[f"beside.{name}"]
+            if given.shape != np.array(value).shape:
+                raise ValueError(f"its {name} does not have the size that its header says")
+            setattr(owner, attribute, own_copy(type(value)(given)))
+
+    def checkpoint(self) -> tuple:
+        """The whole state, for :meth:`rollback`."""
+        return self.arrays(), self.scalars()
+
+    def rollback(self, state: tuple) -> None:
+        """Go back to a :meth:`checkpoint`."""
+        self.set_arrays(state[0])
+        self.set_scalars(state[1])
+
+    # -------------------------------------------------------------------------------------------------------------
+    # Files
+
+    def save(self, path, extra: dict[str, np.ndarray] | None = None, **facts) -> None:
+        """Write all that training changes, shape, box, scale, and `facts` (JSON values) to an ``.npz`` file, whole or
+        not at all. `extra`: further arrays, under names that begin with ``extra.``"""
+        arrays = self.arrays() | {f"extra.{k}": v for k, v in (extra or {}).items()}
+        files.write(path, self.KIND, {**self.constants(), **self.scalars(), **facts}, arrays)
+
+    @classmethod
+    def read(cls, path) -> tuple:
+        """(the field of a file, its header, the `extra` arrays). No code in the file is run.
+
+        Raises `CacheFileError` for a file that is missing, cut short, not of such a field, or of another version.
+        """
+        header, arrays = files.read(path, cls.KIND, cls.UNKNOWN)
+        extra = {k.removeprefix("extra."): arrays.pop(k) for k in list(arrays) if k.startswith("extra.")}
+        try:
+            field = cls.make(header)
+            if unknown := arrays.keys() - field.arrays().keys():
+                raise ValueError(f"it holds {', '.join(sorted(unknown))}, which is no part of such a cache")
+            field.set_arrays(arrays)
+            field.set_scalars(header)
+        except Exception as e:
+            raise files.damaged(path, e) from None
+        return field, header, extra
+
+    @classmethod
+    def load(cls, path) -> tuple:
+        """(the field of a file, its header); see :meth:`read`."""
+        return cls.read(path)[:2]
+
+
+class Field(TrainedField):
     """Values of position and direction, learned online.
 
     ``query(features, w)`` is `scale` times ``max(0, 1 + MLP(hash grid(x), SH(w)))``: an untrained field answers about
@@ -177,6 +344,7 @@ class Field:
     is a view of them for queries, brought up to date by :meth:`sync`.
     """
 
+    KIND = "incident"
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
         "scale": object, "mean": object,
@@ -204,17 +372,6 @@ class Field:
         self._attach_optimizer()
         self.steps = 0
         dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean)
-
-    def _attach_optimizer(self) -> None:
-        self.optimizer = attach_adam(self.current.parameters())
-        self.averaged.assign({k: own_copy(v) for k, v in self.averaged.parameters().items()})
-        self.averaged.pack()
-        dr.eval(self.optimizer, self.averaged)
-
-    def sync(self) -> None:
-        """Bring `current` up to date with training, for queries with ``averaged=False``."""
-        self.current.assign({k: dr.detach(v) for k, v in self.optimizer.items()})
-        self.current.pack()
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -270,63 +427,23 @@ class Field:
         self.averaged.assign(average)
         self.averaged.pack()
 
-    def snapshot(self) -> dict[str, np.ndarray]:
-        """All weights as NumPy arrays."""
-        self.sync()
-        return {
-            f"{name}.{k}": np.array(dr.detach(v))
-            for name in ("current", "averaged")
-            for k, v in getattr(self, name).parameters().items()
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Weights from :meth:`snapshot` of a field of equal shape; the optimiser's moments start anew."""
-        for name in ("current", "averaged"):
-            weights = getattr(self, name)
-            weights.assign({k: own_copy(type(v)(arrays[f"{name}.{k}"])) for k, v in weights.parameters().items()})
-            weights.pack()
-        self._attach_optimizer()
-
     # -------------------------------------------------------------------------------------------------------------
-    # Files
+    # State and files
 
-    def n_parameters(self) -> int:
-        """Number of trained numbers."""
-        return sum(int(np.prod(v.shape)) for v in self.averaged.parameters().values())
+    def constants(self) -> dict:
+        return {"shape": asdict(self.shape), "box": self.box, "scale": float(self.scale[0]), "seed": self.seed}
 
-    def state(self) -> tuple:
-        """All that training changes, for :meth:`set_state`; the optimiser's moments are not in it."""
-        return self.snapshot(), mi.Float(self.mean), self.steps
+    @classmethod
+    def make(cls, constants: dict) -> Field:
+        shape, scale, seed = (constants[k] for k in ("shape", "scale", "seed"))
+        return cls(*constants["box"], FieldShape(**shape), scale=scale, seed=seed)
 
-    def set_state(self, state: tuple) -> None:
-        """Go back to what :meth:`state` gave."""
-        arrays, self.mean, self.steps = state
-        self.restore(arrays)
+    def scalars(self) -> dict:
+        return {**super().scalars(), "mean": float(self.mean[0])}
 
-    def header(self) -> dict:
-        """What a file says of the field beside its weights, in JSON values."""
-        return {
-            "version": FILE_VERSION, "shape": asdict(self.shape), "box": self.box, "scale": float(self.scale[0]),
-            "mean": float(self.mean[0]), "seed": self.seed, "steps": self.steps,
-        }  # fmt: skip
-
-    @staticmethod
-    def of_parts(header: dict, arrays: dict[str, np.ndarray]) -> Field:
-        """The field of a :meth:`header` and a :meth:`snapshot`. Raises what impossible ones lead to."""
-        field = Field(*header["box"], FieldShape(**header["shape"]), scale=header["scale"], seed=header["seed"])
-        files.check_arrays(arrays, field.snapshot())
-        mean, steps = header["mean"], header["steps"]
-        if not (isinstance(steps, int) and steps >= 0 and np.isfinite(mean) and mean >= 0):
-            raise ValueError(f"it says that {steps} steps were made, and a mean of {mean} found")
-        field.restore(arrays)
-        field.mean, field.steps = dr.opaque(mi.Float, mean), steps
-        return field
-
-    def save(self, path, **facts) -> None:
-        """Write weights, shape, box, scale and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
-        files.write(path, {**self.header(), **facts}, self.snapshot())
-
-    @staticmethod
-    def load(path) -> tuple[Field, dict]:
-        """The field of a file, and its header; errors as of :func:`.files.read`."""
-        return files.read(path, FILE_VERSION, None, Field.of_parts)
+    def set_scalars(self, given: dict) -> None:
+        mean = given["mean"]
+        if not (np.isfinite(mean) and mean >= 0):
+            raise ValueError(f"it says that targets had a mean of {mean}")
+        super().set_scalars(given)
+        self.mean = dr.opaque(mi.Float, mean)

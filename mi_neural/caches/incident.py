@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +22,7 @@ from ..transport.records import TrainingRecords, trace_training_paths
 from ..transport.samples import PathSampler
 from . import encoding, loss
 from .blend import Blend
+from .divergence import StepWatch, healthy
 from .field import Field, FieldShape
 from .reliability import Reliability
 
@@ -184,6 +185,12 @@ class IncidentCache:
         self._sensor_freezes: dict[int, bool] = {}
         self.reset()
 
+    def clear_recordings(self) -> None:
+        """Forget what was recorded for a scene that is not rendered any more; it would be kept for good."""
+        self._frame.clear()
+        self._probe.clear()
+        self._sensor_freezes.clear()
+
     def reset(self) -> None:
         """Forget all that was learned. Compiled kernels are kept."""
         self.field: Field | None = None
@@ -193,6 +200,7 @@ class IncidentCache:
         self.history: list[float] = []
         self.levels: list[float] = []  # latest mean targets, over the field's scale
         self._good: dict[str, np.ndarray] | None = None
+        self._step_watch = StepWatch()
         self.statistics = {
             "steps": 0, "records": 0, "nonfinite": 0, "recoveries": 0, "seconds_train": 0.0, "loss": math.nan,
         }  # fmt: skip
@@ -254,10 +262,11 @@ class IncidentCache:
             self.start(scene, sensor, lights)
         if self._good is None:
             self._good = self.field.snapshot()
+        self._step_watch.begin(*self.field.optimizers())
         training = self.training
         rate = training.rate(self.steps) * self.rate_factor
         frame = self._frame if self.freezes(sensor) else self._frame_plain
-        with undisturbed():
+        with dr.resume_grad(), undisturbed():
             outputs = frame(
                 scene, sensor, lights, self.asked, mi.UInt32(self._seed(self.steps)),
                 dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
@@ -272,8 +281,8 @@ class IncidentCache:
         s["nonfinite"] += int(n_bad)
         if self.blend != "ema":
             s[self.MEASURE] = sigma
-        healthy = self._watch(value, mean_target, mean_prediction)
-        if healthy and mean_target > max(self.BRIGHTER, 10 * mean_prediction):
+        goes_on = self._watch(value, mean_target, mean_prediction, self._step_watch.step(*self.field.optimizers()))
+        if goes_on and mean_target > max(self.BRIGHTER, 10 * mean_prediction):
             # Another light: what was measured in the old one is void, and the schedule of rates begins anew
             mi.Log(mi.LogLevel.Info, "mi_neural: the scene became brighter by far; the cache starts anew")
             statistics = self.statistics
@@ -285,15 +294,17 @@ class IncidentCache:
     def _seed(self, step: int) -> int:
         return int(np.random.SeedSequence((self.seed, 0xCAC4E, step)).generate_state(1)[0])
 
-    def _watch(self, value: float, mean_target: float, mean_prediction: float) -> bool:
+    def _watch(self, value: float, mean_target: float, mean_prediction: float, step: float) -> bool:
         """Whether training is healthy; if not, it is undone.
 
-        Divergence: numbers that are not finite, or predictions far above what targets have been. The loss itself is no
-        sign: it is relative to the cache's own mean, so it stays small when the cache explodes, and single batches of
-        healthy training exceed the median a thousandfold.
+        Divergence: numbers that are not finite, predictions far above what targets have been, or a step so long that
+        nothing is left of the network (see :mod:`.divergence`). The loss itself is no sign: it is relative to the
+        cache's own mean, so it stays small when the cache explodes, and single batches of healthy training exceed the
+        median a thousandfold.
         """
         limit = self.EXPLOSION * max(1.0, float(np.median(self.levels)) if self.levels else 1.0)
-        if not (math.isfinite(value) and math.isfinite(mean_prediction)) or mean_prediction > limit:
+        finite = math.isfinite(value) and math.isfinite(mean_prediction)
+        if not (finite and healthy(step, self.steps)) or mean_prediction > limit:
             self.recover()
             return False
         self.history.append(value)
@@ -320,12 +331,51 @@ class IncidentCache:
         """Go on from a field that was trained before."""
         self.field, self.steps, self._good = field, field.steps, None
 
+    def _schedule(self) -> dict:
+        """Numbers that steer training, apart from the field's."""
+        return {"rate_factor": self.rate_factor, "history": list(self.history), "levels": list(self.levels)}
+
+    def save(self, path, **facts) -> None:
+        """Write all that training changes, and `facts` (JSON values), to a file, whole or not at all."""
+        asked, extra, constants = self.asked, {}, None
+        if isinstance(asked, Blend) and asked.grid is not None:
+            extra, constants = asked.grid.arrays(), asdict(asked.grid.constants)
+        self.field.save(path, extra, training=self._schedule(), reliability=constants, **facts)
+
+    def read(self, path) -> tuple:
+        """(field, header, further arrays) of a file of such a cache; hand them to :meth:`resume`."""
+        return self.FIELD.read(path)
+
+    def resume(self, field: Field, header: dict, extra: dict[str, np.ndarray]) -> None:
+        """Go on from a file as if training had not been interrupted.
+
+        Statistics of which predictor to believe are taken over where they were found in the same way. Raises
+        ``ValueError`` for what makes no sense; all is then as it was before.
+        """
+        before = dict(vars(self))  # what follows binds attributes anew and changes none in place
+        self.reset()
+        self.adopt(field)
+        try:
+            found = header["training"]
+            self.rate_factor = float(found["rate_factor"])
+            self.history, self.levels = ([float(v) for v in found[name]] for name in ("history", "levels"))
+            if not 0 < self.rate_factor <= 1:
+                raise ValueError(f"it says that the learning rate was cut to {self.rate_factor}")
+            grid = getattr(self.asked, "grid", None)
+            if grid is not None and header.get("reliability") == asdict(grid.constants):
+                grid.set_arrays(extra)
+        except (KeyError, TypeError, ValueError):
+            vars(self).update(before)
+            raise
+        if self._blend is not None:
+            self._blend.refresh()
+
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field, self.field.state()),
+            None if self.field is None else (self.field, self.field.checkpoint()),
             None if self._blend is None else self._blend.snapshot(),
-            self.steps, self.rate_factor, list(self.history), self._good, dict(self.statistics),
+            self.steps, self._schedule(), self._good, dict(self.statistics),
         )  # fmt: skip
 
     def rollback(self, state) -> None:
@@ -336,13 +386,13 @@ class IncidentCache:
             field.reset()
             self.field = field
             return
-        held, blend, self.steps, self.rate_factor, self.history, self._good, self.statistics = state
+        held, blend, self.steps, schedule, self._good, self.statistics = state
+        self.rate_factor, self.history, self.levels = (schedule[k] for k in ("rate_factor", "history", "levels"))
         if held is not None:
             self.field, kept = held  # training may have begun a new one
-            self.field.set_state(kept)
+            self.field.rollback(kept)
             if self._blend is not None and blend is not None:
                 self._blend.restore(blend)
-            self.levels = []
 
     def settled(self) -> bool:
         """Whether the loss has stopped falling: its median over the last 64 steps is within 2 % of the 64 before."""

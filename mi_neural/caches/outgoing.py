@@ -20,14 +20,12 @@ import numpy as np
 from ..transport.freezing import undisturbed
 from ..transport.samples import PathSampler
 from ..transport.suffixes import CONTENTS, Suffixes, packed, scene_is_glossy, trace_suffixes
-from . import encoding, files, loss
+from . import encoding, loss
 from .blend import OutgoingBlend
-from .field import FieldShape, Weights, attach_adam, descend, own_copy
+from .field import FieldShape, TrainedField, Weights, descend
 from .incident import SCALE_TRIM, IncidentCache, Training
 from .reliability import Reliability
 
-#: Changes when a file written before cannot be read any more.
-FILE_VERSION = 1
 #: Reflectances below this count as this, so that no target is divided by 0 and black surfaces have an answer.
 ALBEDO_MIN = 0.05
 #: Targets above this many times the scale are cut.
@@ -102,11 +100,6 @@ class Places:
         self.view = dr.zeros(mi.Vector3f, n)
         self.age = mi.Float(0)
 
-    def copy(self) -> Places:
-        out = Places(1)
-        out.position, out.view, out.age = mi.Point3f(self.position), mi.Vector3f(self.view), mi.Float(self.age)
-        return out
-
     def remember(self, position, view, valid, sampler) -> None:
         """Put random records of this step into so many random places as make all steps equally likely (reservoir
         sampling); after a horizon, recent ones more so."""
@@ -120,7 +113,7 @@ class Places:
         dr.eval(self.position, self.view, self.age)
 
 
-class OutgoingField:
+class OutgoingField(TrainedField):
     """Outgoing radiance as a function of position, normal, view direction, albedo and roughness, learned online.
 
     ``query(...)`` is ``albedo * scale * max(0, 1 + MLP(...))``: an untrained field answers about `scale` for a surface
@@ -137,6 +130,9 @@ class OutgoingField:
     trained, brought up to date by :meth:`sync`.
     """
 
+    KIND = "outgoing"
+    BESIDE = ("density", "places.position", "places.view", "places.age")
+    UNKNOWN = ("beside.places.position",)
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "scale": object,
         "eta": object, "density": object, "places": object,
@@ -167,19 +163,6 @@ class OutgoingField:
         self.places = Places(N_PLACES)
         self.steps = 0
         dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places)
-
-    def _attach_optimizer(self) -> None:
-        self.optimizer = attach_adam(self.current.parameters())
-        self.averaged.assign({k: own_copy(v) for k, v in self.averaged.parameters().items()})
-        self.averaged.pack()
-        dr.eval(self.optimizer, self.averaged)
-
-    def sync(self) -> None:
-        """Bring `current` up to date with training, for queries with ``averaged=False``; a frozen function that makes
-        such queries calls it itself, before them."""
-        self.current.assign({k: dr.detach(v) for k, v in self.optimizer.items()})
-        self.current.order = self.averaged.order  # the same, but known to frozen functions
-        self.current.pack()
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -300,68 +283,25 @@ class OutgoingField:
         return dr.gather(mi.Float, self.density, self._cell(x))
 
     # -------------------------------------------------------------------------------------------------------------
-    # Files
+    # State and files
 
-    def snapshot(self) -> dict[str, np.ndarray]:
-        """All weights as NumPy arrays."""
-        self.sync()
-        return {
-            f"{name}.{k}": np.array(dr.detach(v))
-            for name in ("current", "averaged")
-            for k, v in getattr(self, name).parameters().items()
-        }
+    def constants(self) -> dict:
+        return {"shape": asdict(self.shape), "box": self.box, "given_scale": self.given_scale, "seed": self.seed}
 
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Weights from :meth:`snapshot` of a field of equal shape; the optimiser's moments start anew."""
-        for name in ("current", "averaged"):
-            weights = getattr(self, name)
-            weights.assign({k: own_copy(type(v)(arrays[f"{name}.{k}"])) for k, v in weights.parameters().items()})
-            weights.pack()
-        self._attach_optimizer()
+    @classmethod
+    def make(cls, constants: dict) -> OutgoingField:
+        shape, scale, seed = (constants[k] for k in ("shape", "given_scale", "seed"))
+        return cls(*constants["box"], OutgoingShape(**shape), scale=scale, seed=seed)
 
-    def n_parameters(self) -> int:
-        """Number of trained numbers."""
-        return sum(int(np.prod(v.shape)) for v in self.averaged.parameters().values())
+    def scalars(self) -> dict:
+        return {**super().scalars(), "scale": float(self.scale[0]), "eta": float(self.eta[0])}
 
-    def state(self) -> tuple:
-        """All that training changes, for :meth:`set_state`; the optimiser's moments are not in it."""
-        numbers = mi.Float(self.scale), mi.Float(self.eta), mi.Float(self.density)
-        return self.snapshot(), *numbers, self.places.copy(), self.steps
-
-    def set_state(self, state: tuple) -> None:
-        """Go back to what :meth:`state` gave."""
-        arrays, self.scale, self.eta, self.density, self.places, self.steps = state
-        self.restore(arrays)
-
-    def header(self) -> dict:
-        """What a file says of the field beside its weights, in JSON values."""
-        return {
-            "kind": "outgoing", "version": FILE_VERSION, "shape": asdict(self.shape), "box": self.box,
-            "given_scale": self.given_scale, "scale": float(self.scale[0]), "eta": float(self.eta[0]),
-            "seed": self.seed, "steps": self.steps,
-        }  # fmt: skip
-
-    @staticmethod
-    def of_parts(header: dict, arrays: dict[str, np.ndarray]) -> OutgoingField:
-        """The field of a :meth:`header` and a :meth:`snapshot`. Raises what impossible ones lead to."""
-        shape = OutgoingShape(**header["shape"])
-        field = OutgoingField(*header["box"], shape, scale=header["given_scale"], seed=header["seed"])
-        files.check_arrays(arrays, field.snapshot())
-        scale, eta, steps = header["scale"], header["eta"], header["steps"]
-        if not (isinstance(steps, int) and steps >= 0 and 0 <= scale < math.inf and 0 <= eta <= 1):
-            raise ValueError(f"it says {steps} steps, a scale of {scale} and an average filled to {eta}")
-        field.restore(arrays)
-        field.scale, field.eta, field.steps = dr.opaque(mi.Float, scale), dr.opaque(mi.Float, eta), steps
-        return field
-
-    def save(self, path, **facts) -> None:
-        """Write weights, shape, box, scale and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
-        files.write(path, {**self.header(), **facts}, self.snapshot())
-
-    @staticmethod
-    def load(path) -> tuple[OutgoingField, dict]:
-        """The field of a file, and its header; errors as of :func:`.files.read`."""
-        return files.read(path, FILE_VERSION, "outgoing", OutgoingField.of_parts)
+    def set_scalars(self, given: dict) -> None:
+        scale, eta = given["scale"], given["eta"]
+        if not (0 <= scale < math.inf and 0 <= eta <= 1):
+            raise ValueError(f"it says a scale of {scale} and an average filled to {eta}")
+        super().set_scalars(given)
+        self.scale, self.eta = dr.opaque(mi.Float, scale), dr.opaque(mi.Float, eta)
 
 
 def _sanitize(usable, x, n, w, albedo, roughness) -> tuple:

@@ -11,19 +11,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.suffixes import scene_is_glossy
-from . import files
 from .accuracy import Accuracy, Pairs
-from .field import Field, FieldShape
+from .field import Field, FieldShape, TrainedField
 from .incident import Training, learn, reflect
 from .outgoing import OutgoingCache, OutgoingField, OutgoingShape, OutgoingTraining, fitted, training_paths
 
-#: Changes when a file written before cannot be read any more.
-FILE_VERSION = 1
 
-
-class PairField:
+class PairField(TrainedField):
     """An outgoing and an incident field, and their accuracy, with the protocol of either. A PyTree."""
 
+    KIND = "pair"
+    UNKNOWN = tuple(f"outgoing.{name}" for name in OutgoingField.UNKNOWN)
     DRJIT_STRUCT = {"outgoing": object, "incident": object, "accuracy": object}  # noqa: RUF012
     #: The parts, in the order of files.
     PARTS = ("outgoing", "incident", "accuracy")
@@ -63,15 +61,8 @@ class PairField:
         for name in self.PARTS:
             getattr(self, name).reset()
 
-    def state(self) -> tuple:
-        """All that training changes, for :meth:`set_state`; the optimisers' moments are not in it."""
-        return self.outgoing.state(), self.incident.state(), self.accuracy.snapshot()
-
-    def set_state(self, state: tuple) -> None:
-        """Go back to what :meth:`state` gave."""
-        self.outgoing.set_state(state[0])
-        self.incident.set_state(state[1])
-        self.accuracy.restore(state[2])
+    def optimizers(self) -> list:
+        return [*self.outgoing.optimizers(), *self.incident.optimizers()]
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """All weights and measurements as NumPy arrays."""
@@ -82,25 +73,37 @@ class PairField:
         for name in self.PARTS:
             getattr(self, name).restore(_part(arrays, name))
 
-    def save(self, path, **facts) -> None:
-        """Write all of it and `facts` (JSON values) to an ``.npz`` file, whole or not at all."""
-        headers = {"outgoing": self.outgoing.header(), "incident": self.incident.header()}
-        files.write(path, {"kind": "pair", "version": FILE_VERSION, **headers, **facts}, self.snapshot())
+    # -------------------------------------------------------------------------------------------------------------
+    # State and files
 
-    @staticmethod
-    def of_parts(header: dict, arrays: dict[str, np.ndarray]) -> PairField:
-        """The pair of a file. Raises what impossible parts lead to."""
-        outgoing = OutgoingField.of_parts(header["outgoing"], _part(arrays, "outgoing"))
-        incident = Field.of_parts(header["incident"], _part(arrays, "incident"))
-        accuracy = Accuracy(*outgoing.box, scale=float(outgoing.scale[0]))
-        files.check_arrays(_part(arrays, "accuracy"), accuracy.snapshot())
-        accuracy.restore(_part(arrays, "accuracy"))
-        return PairField(outgoing, incident, accuracy)
+    def constants(self) -> dict:
+        return {name: getattr(self, name).constants() for name in ("outgoing", "incident")}
 
-    @staticmethod
-    def load(path) -> tuple[PairField, dict]:
-        """The pair of a file, and its header; errors as of :func:`.files.read`."""
-        return files.read(path, FILE_VERSION, "pair", PairField.of_parts)
+    @classmethod
+    def make(cls, constants: dict) -> PairField:
+        outgoing, incident = OutgoingField.make(constants["outgoing"]), Field.make(constants["incident"])
+        # The grid of errors measures in units of what the outgoing field was made for
+        return cls(outgoing, incident, Accuracy(*outgoing.box, scale=constants["incident"]["scale"]))
+
+    def scalars(self) -> dict:
+        return {"steps": self.steps, "parts": {n: getattr(self, n).scalars() for n in ("outgoing", "incident")}}
+
+    def set_scalars(self, given: dict) -> None:
+        for name in ("outgoing", "incident"):
+            getattr(self, name).set_scalars(given["parts"][name])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        fields = {name: getattr(self, name).arrays() for name in ("outgoing", "incident")}
+        parts = {**fields, "accuracy": self.accuracy.snapshot()}
+        return {f"{name}.{k}": v for name, part in parts.items() for k, v in part.items()}
+
+    def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        for name in ("outgoing", "incident"):
+            getattr(self, name).set_arrays(_part(arrays, name))
+        measured, known = _part(arrays, "accuracy"), self.accuracy.snapshot()
+        if {k: v.shape for k, v in measured.items()} != {k: v.shape for k, v in known.items()}:
+            raise ValueError("its measurements do not have the sizes of this grid")
+        self.accuracy.restore(measured)
 
 
 def _part(arrays: dict, name: str) -> dict:

@@ -242,7 +242,7 @@ class RadianceCache:
 
     @staticmethod
     def load(path) -> RadianceCache:
-        """The cache of a file; the optimiser's moments start anew. Raises as :meth:`OutgoingField.load`."""
+        """The cache of a file. Raises as :meth:`OutgoingField.load`."""
         field, header = OutgoingField.load(path)
         try:
             maxima = header["max_inference_sample_count"], header["max_training_sample_count"]

@@ -244,6 +244,32 @@ class ReliabilityGrid:
                  self.records, self.moments, self.sums, self.region, self.region_sums, self.all_sums)  # fmt: skip
         dr.make_opaque(state)
 
+    #: What records change, by attribute.
+    LEARNED = ("updates", "sigma", "weight", "records", "moments", "sums", "region", "region_sums", "all_sums")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that records have changed, as NumPy arrays."""
+        found = {}
+        for name in self.LEARNED:
+            value = getattr(self, name)
+            values = {f"{name}.{k}": v for k, v in enumerate(value)} if isinstance(value, list) else {name: value}
+            found |= {k: np.array(v) for k, v in values.items()}
+        return found
+
+    def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from :meth:`arrays` of a grid with equal constants. Raises ``ValueError`` where one does not fit."""
+        expected = self.arrays()
+        if {k: v.shape for k, v in arrays.items()} != {k: v.shape for k, v in expected.items()}:
+            raise ValueError("the statistics of reliability do not have the sizes of this grid")
+        for name in self.LEARNED:
+            value = getattr(self, name)
+            if isinstance(value, list):
+                new = [type(v)(arrays[f"{name}.{k}"].astype(np.float32)) for k, v in enumerate(value)]
+            else:
+                new = type(value)(arrays[name].astype(expected[name].dtype))
+            setattr(self, name, new)
+        dr.make_opaque(*(getattr(self, name) for name in self.LEARNED))
+
     # -----------------------------------------------------------------------------------------------------------------
     # Where
 

@@ -17,6 +17,7 @@ import numpy as np
 from ..transport.freezing import undisturbed
 from ..transport.samples import PathSampler
 from . import encoding
+from .divergence import StepWatch, healthy
 from .field import FieldShape, Weights, attach_adam, descend, own_copy
 from .schedule import Ramp
 
@@ -59,6 +60,20 @@ class VisibilityField:
         self.weights.assign({k: own_copy(v) for k, v in self.weights.parameters().items()})
         self.weights.pack()
         dr.make_opaque(self.box_min, self.box_inv_extent)
+        dr.eval(self.optimizer, self.weights)
+
+    def snapshot(self) -> tuple[dict, dict]:
+        """Weights being trained and averaged ones, as NumPy arrays by name."""
+        trained = {k: np.array(dr.detach(v)) for k, v in self.optimizer.items()}
+        return trained, {k: np.array(dr.detach(v)) for k, v in self.weights.parameters().items()}
+
+    def restore(self, kept: tuple[dict, dict]) -> None:
+        """Go back to a :meth:`snapshot`; the optimiser's moments start anew."""
+        trained, averaged = kept
+        known = self.weights.parameters()
+        self.optimizer = attach_adam({k: own_copy(type(v)(trained[k])) for k, v in known.items()})
+        self.weights.assign({k: own_copy(type(v)(averaged[k])) for k, v in known.items()})
+        self.weights.pack()
         dr.eval(self.optimizer, self.weights)
 
     def query(self, x) -> list:
@@ -154,8 +169,12 @@ def surface_point(scene, ray, active):
 class VisibilityCache:
     """A field of visibilities together with its training.
 
-    `groups` is a :class:`~mi_neural.lights.clusters.Groups`: what the outputs stand for.
+    `groups` is a :class:`~mi_neural.lights.clusters.Groups`: what the outputs stand for. A step that diverges is
+    undone, and the learning rate halved; `statistics` counts such recoveries.
     """
+
+    #: Steps between snapshots that a divergence is undone with.
+    SNAPSHOT_EVERY = 64
 
     def __init__(self, training: VisibilityTraining | None = None, shape: FieldShape | None = None, seed: int = 0):
         self.training, self.seed = training or VisibilityTraining(), seed
@@ -167,7 +186,12 @@ class VisibilityCache:
         """Forget all that was learned."""
         self.field: VisibilityField | None = None
         self.steps = 0
-        self.statistics = {"visibility_steps": 0, "visibility_loss": math.nan, "seconds_visibility": 0.0}
+        self.rate_factor = 1.0
+        self._good: tuple[dict, dict] | None = None
+        self._step_watch = StepWatch()
+        self.statistics = {
+            "visibility_steps": 0, "visibility_loss": math.nan, "visibility_recoveries": 0, "seconds_visibility": 0.0,
+        }  # fmt: skip
 
     def start(self, scene, sensor, n_outputs: int) -> None:
         """Make the field in the box of what the camera sees."""
@@ -220,6 +244,8 @@ class VisibilityCache:
         """So many steps, each on fresh points."""
         if self.field is None:
             self.start(scene, sensor, groups.n_groups)
+        if self._good is None:
+            self._good = self.field.snapshot()
         t0 = time.perf_counter()
         done = 0
         while done < steps:
@@ -231,15 +257,31 @@ class VisibilityCache:
             with undisturbed():
                 points = self._records(scene, sensor, table, groups, seeds)
                 for k in range(n_steps):
+                    self._step_watch.begin(self.field.optimizer)
                     loss = self._step(self.field, *_part(points, k, n_steps),
-                                      dr.opaque(mi.Float, self.training.rate(self.steps)),
+                                      dr.opaque(mi.Float, self.training.rate(self.steps) * self.rate_factor),
                                       dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
                     self.steps += 1
+                    self._watch(loss[0])
             done += n_steps
         if steps:
             self.statistics["visibility_loss"] = loss[0]
         self.statistics["visibility_steps"] += steps
         self.statistics["seconds_visibility"] += time.perf_counter() - t0
+
+    def _watch(self, loss: float) -> None:
+        """Undo a step that diverged: go back to the last good weights, with half the learning rate."""
+        if math.isfinite(loss) and healthy(self._step_watch.step(self.field.optimizer), self.steps):
+            if self.steps % self.SNAPSHOT_EVERY == 0:
+                self._good = self.field.snapshot()
+            return
+        self.field.restore(self._good)
+        self.rate_factor *= 0.5
+        self.statistics["visibility_recoveries"] += 1
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"mi_neural: visibility diverged at step {self.steps}; last good weights restored, learning rate halved",
+        )
 
 
 def _part(arrays, k: int, n: int) -> list:

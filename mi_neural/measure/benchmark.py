@@ -80,10 +80,13 @@ class Row:
 
 @dataclass
 class Picture:
-    """An image that belongs to a row, with the FLIP map against the reference where there is one."""
+    """An image that belongs to a row, with the FLIP map against the reference where there is one.
+
+    `rendered` is None for one that an earlier run has measured.
+    """
 
     row: Row
-    rendered: Rendered
+    rendered: Rendered | None
     rgb: np.ndarray
     flip_map: np.ndarray | None
 
@@ -112,6 +115,7 @@ class Bench:
     """Measures integrators on one scene against one reference; hand each finished picture to `on_picture`.
 
     Ctrl-C: the rendering under way is finished early, its row is marked, and ``KeyboardInterrupt`` is raised after it.
+    What `kept` holds (a :class:`~mi_neural.measure.kept.Kept`) is not measured again.
     """
 
     def __init__(
@@ -122,8 +126,9 @@ class Bench:
         environment: dict[str, object],
         on_picture: Callable[[Picture], None],
         progress: Callable[[str], budget.Progress | None] | None = None,
+        kept=None,
     ) -> None:
-        self.loaded, self.reference, self.guides = loaded, reference, guides
+        self.loaded, self.reference, self.guides, self.kept = loaded, reference, guides, kept
         self.environment, self.on_picture = environment, on_picture
         self._progress = progress or (lambda text: None)
         self.exposures = metrics.flip_exposures(reference.rgb) if reference else None
@@ -131,12 +136,26 @@ class Bench:
 
     def run(self, cases: list[Case], plan: Plan) -> None:
         """Measure all cases: one-shot by budgets, then steady and sample rows."""
+        kinds = [False, True] if self.guides else [False]
         for case in cases:
-            self.compile(case, plan.seed)
-            for seconds in plan.seconds:
-                self.one_shot(case, seconds, plan.seed)
+            label, compiled = case.spec.label, False
+            parts = [
+                ([(label, "one-shot", s, d) for d in kinds], lambda s=s, case=case: self.one_shot(case, s, plan.seed))
+                for s in plan.seconds
+            ]
             if plan.steady_frames:
-                self.steady(case, plan)
+                keys = [(label, "sample", None, d) for d in kinds]
+                keys += [(label, "steady", s, d) for s in plan.frame_seconds for d in kinds]
+                parts.append((keys, lambda case=case: self.steady(case, plan)))
+            for keys, measure in parts:
+                if self.kept is not None and (found := self.kept.pictures(keys, self.reference, self.exposures)):
+                    for picture in found:
+                        self.on_picture(picture)
+                    continue
+                if not compiled:
+                    self.compile(case, plan.seed)
+                    compiled = True
+                measure()
 
     # ----------------------------------------------------------------------------------------------------------------
 

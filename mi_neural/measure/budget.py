@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,6 +29,8 @@ PASS_SPP = (1, 4, 16, 64)
 PASS_SECONDS = 1.0
 #: Most samples in one pass. 2^21 paths need less than 1 GiB in every scene measured.
 PASS_SAMPLES = 2**21
+#: Seconds after which an unfinished image is handed to `keep`, so that a killed process leaves it.
+KEEP_SECONDS = 60.0
 
 # Streams of random numbers that share nothing: warm-up, image, guides of the denoiser, reference
 STREAM_WARM_UP, STREAM_IMAGE, STREAM_GUIDES, STREAM_REFERENCE = range(4)
@@ -184,10 +186,14 @@ def train_first(scene, integrator, sensor: int = 0, progress: Progress | None = 
 
 
 def render_samples(
-    scene, integrator, spp: int, seed: int = 0, sensor: int = 0, progress: Progress | None = None
-) -> Rendered:
-    """Render `spp` samples a pixel. The division into passes depends on film and `spp` alone, and so does the image."""
-    run = _Run(scene, integrator, seed, sensor)
+    scene, integrator, spp: int, seed: int = 0, sensor: int = 0, progress: Progress | None = None,
+    keep: Callable[[Rendered], None] | None = None,
+) -> Rendered:  # fmt: skip
+    """Render `spp` samples a pixel. The division into passes depends on film and `spp` alone, and so does the image.
+
+    `keep` is called every KEEP_SECONDS with the image so far, marked as interrupted.
+    """
+    run = _Run(scene, integrator, seed, sensor, keep)
     try:
         run.plan(spp)
         for n in plan_passes(scene, spp, sensor):
@@ -218,6 +224,7 @@ def render_seconds(
     progress: Progress | None = None,
     pretrained: bool = False,
     pass_times: dict[int, float] | None = None,
+    keep: Callable[[Rendered], None] | None = None,
 ) -> Rendered:
     """Render as many samples as fit into `seconds` of wall time, kernels being compiled (:func:`warm_up`).
 
@@ -226,9 +233,10 @@ def render_seconds(
     The last pass may end up to half of a 1-sample pass late. At least one pass is rendered, however small the budget.
 
     `pass_times` (samples a pixel -> seconds) is read and updated: hand the same to every frame of a sequence.
+    `keep` is called every KEEP_SECONDS with the image so far, marked as interrupted.
     """
     start = clock()
-    run = _Run(scene, integrator, seed, sensor)
+    run = _Run(scene, integrator, seed, sensor, keep)
     times = {} if pass_times is None else pass_times
     sizes = pass_sizes(scene, sensor)
     try:
@@ -280,7 +288,8 @@ def choose_pass(sizes: list[int], times: dict[int, float], remaining: float) -> 
 class _Run:
     """The state of one rendering: film, clocks, number of passes."""
 
-    def __init__(self, scene, integrator, seed: int, sensor: int) -> None:
+    def __init__(self, scene, integrator, seed: int, sensor: int, keep: Callable[[Rendered], None] | None) -> None:
+        self.keep, self.kept = keep, clock()
         self.scene, self.integrator, self.seed, self.sensor = scene, integrator, seed, sensor
         self.film = Accumulator()
         self.n_passes = 0
@@ -310,6 +319,9 @@ class _Run:
         trained = min(max(0.0, statistics(self.integrator).get("seconds_train", 0.0) - trained_before), seconds)
         self.seconds_train += trained
         self.seconds_render += seconds - trained
+        if self.keep is not None and clock() - self.kept > KEEP_SECONDS:
+            self.keep(replace(self.result(), interrupted=True))
+            self.kept = clock()
         return seconds - trained
 
     def result(self) -> Rendered:

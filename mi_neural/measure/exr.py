@@ -93,7 +93,10 @@ def write(
     with np.errstate(over="ignore"):  # half: too large becomes infinite, as the format has it
         pixels = {name: np.ascontiguousarray(values, dtype) for name, values in pixels.items()}
     with replacing(path) as temporary:
-        OpenEXR.File(header, pixels).write(str(temporary))
+        try:
+            OpenEXR.File(header, pixels).write(str(temporary))
+        except RuntimeError as error:  # what the library makes of a full disk
+            raise OSError(f"cannot write {path}: {error}") from None
 
 
 def read(path: str | os.PathLike) -> Image:

@@ -219,8 +219,8 @@ class Run:
     cache_0012.npz   what the integrator had learned after 12 frames, where it can say (`save_cache`)
 
     Started again with the same settings, a case goes on after its last frame: frames since the last cache file are
-    rendered anew. A cache file holds the networks' weights and not the optimiser's moments nor what a light sampler
-    learned: after it images are not those of an uninterrupted run to the last digit. Integrators without `save_cache`
+    rendered anew. A cache file holds all that training changes, but not what a light sampler learned: with one, images
+    after it are not those of an uninterrupted run to the last digit. Integrators without `save_cache`
     simply go on. ``KeyboardInterrupt`` passes through; `results` then holds what is done.
     """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -128,6 +129,27 @@ def depth_notes(
 
 
 # ------------------------------------------------------------------------------------------------------------------
+# Being stopped
+
+_stopped: list[int] = []
+
+
+def stop_alike() -> None:
+    """Have SIGTERM (schedulers, `kill`) stop the program as Ctrl-C does: with what is done on disk."""
+
+    def stop(number, frame):
+        _stopped.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, stop)
+
+
+def stopped_by() -> int:
+    """The signal that the program was told to stop by."""
+    return _stopped[-1] if _stopped else int(signal.SIGINT)
+
+
+# ------------------------------------------------------------------------------------------------------------------
 # Writing and showing
 
 
@@ -169,6 +191,20 @@ def announce(text: str) -> None:
 
 
 def write_image(path: Path, row: benchmark.Row, image, rendered: budget.Rendered) -> None:
+    """Write an image with its facts. Where that fails, as on a full disk, another place is tried before it is lost."""
+    try:
+        _write_image(path, row, image, rendered)
+    except OSError as error:
+        refuge = Path(tempfile.mkdtemp(prefix="mi-neural-")) / path.name
+        try:
+            _write_image(refuge, row, image, rendered)
+        except OSError:
+            refuge.parent.rmdir()
+            raise error from None
+        raise OSError(f"cannot write {path} ({load.one_line(error)}); the image is in {refuge}") from None
+
+
+def _write_image(path: Path, row: benchmark.Row, image, rendered: budget.Rendered) -> None:
     if path.suffix.lower() == ".png":
         exr.write_png(path, image)
         return

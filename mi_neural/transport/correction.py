@@ -44,7 +44,8 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
     """The part of `difference` that stands out of its noise.
 
     `difference` and its `variance`: shape (height, width, channels); `level`: positive, of the same shape, what the
-    correction is thought relative to. Returns `difference` itself where the variance is 0, and 0 where it is not finite.
+    correction is thought relative to. Returns `difference` itself where the variance is 0, and 0 where it is not
+    finite.
     """
     ok = np.isfinite(difference) & np.isfinite(variance)
     g = np.maximum(level, 0) + max(FLOOR * float(level.mean()), 1e-30)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import signal
+import threading
 from contextlib import contextmanager
 
 import drjit as dr
@@ -31,11 +33,33 @@ def can_freeze(sensor) -> bool:
 
 @contextmanager
 def undisturbed():
-    """No garbage collection inside: memory of an old scene, freed while a function is recorded, ends the process."""
-    enabled = gc.isenabled()
+    """No garbage collection inside: memory of an old scene, freed while a function is recorded, ends the process.
+
+    And no Ctrl-C: a function that is left while it is recorded leaves its arguments, a cache's weights among them,
+    unusable. What is sent inside (SIGINT, or a SIGTERM that the program answers) takes effect at the end.
+    """
+    collects = gc.isenabled()
     gc.disable()
+    with _deferred(signal.SIGTERM, signal.SIGINT):
+        try:
+            yield
+        finally:
+            if collects:
+                gc.enable()
+
+
+@contextmanager
+def _deferred(*numbers):
+    """Signals that Python handles are handled after the block; only the main thread has any to handle."""
+    handlers, sent = {}, []
+    if threading.current_thread() is threading.main_thread():
+        handlers = {n: h for n in numbers if callable(h := signal.getsignal(n))}
     try:
+        for number in handlers:
+            signal.signal(number, lambda number, _: sent.append(number))
         yield
     finally:
-        if enabled:
-            gc.enable()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if sent:
+        handlers[sent[0]](sent[0], None)

@@ -110,7 +110,10 @@ def balance(M_a, target_a, M_b, target_b):
 
     Ratios are taken before they are multiplied, so that targets of 1e30 pass.
     """
-    a, b = ((M > 0) & (target > 0) & dr.isfinite(target) for M, target in ((M_a, target_a), (M_b, target_b)))
+    a, b = (
+        (M > 0) & (target > 0) & dr.isfinite(M) & dr.isfinite(target)
+        for M, target in ((M_a, target_a), (M_b, target_b))
+    )
     ratio = (M_b / dr.select(a, M_a, 1)) * (target_b / dr.select(a, target_a, 1))
     return dr.select(a, 1 / (1 + dr.select(b, ratio, 0)), 0)
 

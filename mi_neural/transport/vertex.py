@@ -10,11 +10,13 @@ import mitsuba as mi
 
 
 def mis_weight(pdf_a, pdf_b):
-    """Power heuristic with exponent 2 (Veach 1997, eq. 9.13); 0 where `pdf_a` is 0, so no 0/0 can arise.
+    """Power heuristic with exponent 2 (Veach 1997, eq. 9.13); 0 where `pdf_a` is 0, or where both are infinite or one
+    is no number: always in [0, 1].
 
     Both densities are over solid angle. The ratio is squared, not they: a small or far light's exceeds 1e20.
     """
-    return dr.select(pdf_a > 0, 1 / (1 + dr.square(pdf_b / pdf_a)), 0)
+    weight = 1 / (1 + dr.square(pdf_b / pdf_a))
+    return dr.select((pdf_a > 0) & (weight >= 0), weight, 0)
 
 
 def finite(value, active):
@@ -65,7 +67,6 @@ def direct_light(scene, si, bsdf, sample, active, alone=False):
     full = ds.delta | (alone(pdf_bsdf) if callable(alone) else bool(alone))
     w_mis = dr.select(full, 1, mis_weight(ds.pdf, pdf_bsdf))
     return finite(f * weight * w_mis, active)
-
 
 
 def emitted(
