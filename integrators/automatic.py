@@ -13,6 +13,9 @@ from mi_neural.caches.incident import reflect
 from mi_neural.integrators import prefix
 from mi_neural.transport.suffixes import surface_of
 
+#: Queries a camera sample, at its first vertex and at its end; fewer where only one of them is asked, more where the
+#: end is in the incident cache.
+QUERIES = 2.0
 #: For the class docstrings of the plugins that offer it.
 AUTO = """
     With ``termination="auto"``, ``nirc`` and ``nrc`` are one and the same estimator: it has both caches, trained on the

@@ -50,6 +50,8 @@ class NIRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
+        if self.termination == "auto":
+            return automatic.QUERIES if self.needs_cache else 0.0
         return 0.0 if not self.needs_cache else max(self.cache_samples, self.n_light)
 
     @property

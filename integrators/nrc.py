@@ -67,7 +67,9 @@ class NRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
-        return 1.0 if self.needs_cache else 0.0
+        if not self.needs_cache:
+            return 0.0
+        return automatic.QUERIES if self.termination == "auto" else 1.0
 
     # -------------------------------------------------------------------------------------------------------------
 

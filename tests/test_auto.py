@@ -112,26 +112,24 @@ def test_cells_tell_places_apart(rng):
     """A cache that is right on one side of the box and off by its half on the other."""
     accuracy = Accuracy(*BOX, AccuracyShape(resolution=2))
     for _ in range(20):
-        p = pairs(rng, 4096, 0.0, 0.0, 0.2)
+        p = pairs(rng, 4096, 0.0, 1.0, 0.2)
         p.outgoing = dr.select(p.position.x < 0.5, p.outgoing, 1.5 * p.outgoing)
         observe(accuracy, p)
     x = mi.Point3f([0.25, 0.75], 0.25, 0.25)
-    share = np.array(accuracy.choose(x, mi.Vector3f(0, 0, 1) + dr.zeros(mi.Vector3f, 2), 4.0)[0])
+    share = np.array(accuracy.choose(x, mi.Vector3f(0, 0, 1) + dr.zeros(mi.Vector3f, 2), 1.0)[0])
     print(f"shares {share}")
-    assert share[0] > 0.9 and share[1] < 0.2
+    assert share[0] > 0.8 and share[1] == pytest.approx(0.04 / (0.04 + 0.25), abs=0.03)
 
 
 def test_without_a_bias_only_what_is_not_known_counts(rng):
     """The bias found is its standard error, and falls as pairs come in; so the share rises."""
     shares = []
-    for frames in (1, 10, 100):
+    for n in (256, 2**14, 2**20):
         accuracy = Accuracy(*BOX)
-        for _ in range(frames):
-            observe(accuracy, pairs(rng, 256, 0.0, 0.0, 1.0))
-        share, _ = accuracy.choose(mi.Point3f(0.5), mi.Vector3f(0, 0, 1), 64.0)
-        shares.append(float(share[0]))
+        observe(accuracy, pairs(rng, n, 0.0, 1.0, 1.0))
+        shares.append(float(accuracy.choose(mi.Point3f(0.5), mi.Vector3f(0, 0, 1), 64.0)[0][0]))
     print(shares)
-    assert 0 < shares[0] < shares[1] < shares[2] and shares[2] > 0.5
+    assert 0 < shares[0] < shares[1] < shares[2] and shares[2] > 0.8
 
 
 def test_where_nothing_was_measured_nothing_is_trusted():
@@ -318,16 +316,19 @@ def test_known_answer_within_two_percent(plugin, sphere):
     assert abs(image.mean() - 1) < 0.02 and np.abs(image - 1).max() < 0.15
 
 
-def test_mix_has_less_error_than_either_part(trained, box):
+def test_mix_has_less_error_than_either_part():
     """The cache at the first vertex alone, tracing alone, and the mix, at 4 samples a pixel."""
-    path = np.array(mi.render(box, integrator=mi.load_dict({"type": "path"}), spp=4096), dtype=np.float64)
+    box = mi.load_file(str(scenes.path("cornell_box")), resx=48, resy=48)
+    trained = auto(train_samples=1024)
+    trained.train(box, 60)
+    path = np.array(mi.render(box, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
     keys = {"spread_threshold": 0.0}, {}
     parts = [outgoing_alone(trained, box, **k) for k in keys]
     lamp = path.max(axis=-1, keepdims=True) > 1  # its edges are as noisy whatever is traced
     weight = np.where(lamp, 0, 1 / (path.mean(axis=-1, keepdims=True) ** 2 + 1e-2))
 
     def error(integrator):
-        images = np.stack([render(box, integrator, 4, k)[..., :3] for k in range(4)])
+        images = np.stack([render(box, integrator, 4, k) for k in range(4)])
         return np.mean((images - path) ** 2 * weight)
 
     cache, traced, ours = error(parts[0]), error(parts[1]), error(trained)

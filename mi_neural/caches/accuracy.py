@@ -27,7 +27,7 @@ from .reliability import HASH_FACTORS, frame_sums
 #: What is kept per cell.
 ERRORS = ("noise_bounce", "noise_incident", "bias_incident", "bias_outgoing", "bias_product")
 #: Relative differences are cut here: single paths of a thousand times the light would rule a cell for long.
-LARGEST = 10.0
+LARGEST = 30.0
 #: Added to the squared prediction that differences are relative to, over the squared scale: as in relMSE.
 LEVEL_EPSILON = 1e-2
 #: Pairs of the whole grid's mean that a cell's own noise starts from. A bias starts from more, see `_finish`.
@@ -216,19 +216,23 @@ class Accuracy:
         dr.eval(self.sums, self.n_pairs, self.squares)
         *sums, n = self.sums
         inv_all = dr.select(self.n_pairs > 0, 1 / dr.maximum(self.n_pairs, 1e-3), 0)
-        means = [dr.sum(s) * inv_all for s in sums]
-        found = [(s + PRIOR * mean) / (n + PRIOR) for s, mean in zip(sums[:2], means, strict=False)]
-        for s, mean, square in zip(sums[2:], means[2:], self.squares, strict=True):
-            one_pair = square * inv_all
-            deviation = dr.maximum(dr.abs(mean), dr.sqrt(one_pair * inv_all))  # at least its standard error
-            weight = dr.clip(one_pair / dr.maximum(dr.square(deviation), 1e-20), PRIOR, 1e6)
-            found.append((s + weight * mean) / (n + weight))
-            if s is not sums[-1]:  # a square is positive, and not known to be less than that
-                found[-1] = dr.maximum((s + weight * deviation) / (n + weight), 0.1 * deviation)
-        limit = dr.sqrt(found[2] * found[3])
-        found[4] = dr.clip(found[4], -limit, limit)
-        for name, value in zip(ERRORS, found, strict=True):
-            setattr(self, name, value)
+
+        def drawn(total, mean, weight):
+            return (total + weight * mean) / (n + weight)
+
+        self.noise_bounce, self.noise_incident = (drawn(s, dr.sum(s) * inv_all, PRIOR) for s in sums[:2])
+        means = [dr.sum(total) * inv_all for total in sums[2:]]
+        variances = [square * inv_all for square in self.squares]
+        # A squared bias counts at least as its mean's standard error: what is not known is not trusted
+        means[:2] = [dr.maximum(m, dr.sqrt(s * inv_all)) for m, s in zip(means[:2], variances[:2], strict=True)]
+        b_i, b_o, c = (
+            drawn(total, m, dr.clip(s / dr.maximum(dr.square(m), 1e-20), PRIOR, 1e6))
+            for total, m, s in zip(sums[2:], means, variances, strict=True)
+        )
+        self.bias_incident, self.bias_outgoing = dr.maximum(b_i, 0.1 * means[0]), dr.maximum(b_o, 0.1 * means[1])
+        limit = dr.sqrt(self.bias_incident * self.bias_outgoing)
+        self.bias_product = dr.clip(c, -limit, limit)
+
         δ, δδ, count = self.region_sums
         known = δδ > 0
         drift = dr.square(δ) / dr.select(known, δδ * count, 1)
