@@ -21,14 +21,14 @@ AUTO = """
     With ``termination="auto"``, ``nirc`` and ``nrc`` are one and the same estimator: it has both caches, trained on the
     same paths, and decides at each vertex by their errors, measured while training (no reference, no further rays).
     Training paths start in twos from the same point, so that the mean of (A - T)(A - T') over pairs of independent
-    estimates is the squared bias of a cache's answer A, and (T - T')²/2 the noise v of tracing on, both by cells of
-    1/16 of the box. For an image of N samples a pixel:
+    estimates is the squared bias of a cache's answer A (b_o², b_i² of the incident one, with noise v_i), and (T - T')²/2
+    the noise v of tracing on, all by cells of 1/16 of the box. For an image of N samples a pixel:
 
-    - first vertex: the outgoing cache's answer with the weight :math:`v/N / (v/N + b_o^2)`, the mix of least squared
-      error; what is traced beside it ends right there in the incident cache if :math:`1.4 v_i/N + b_i^2 < v/N` (1.4:
-      its cost), else it goes on.
+    - first vertex: what is traced either ends right there, in the incident cache, or goes on; it is mixed with the
+      outgoing cache's answer by the weight of least squared error, :math:`v/N / (v/N + b_o^2)` if it goes on. Of the
+      two, that one whose mix has the smaller error in equal time.
     - later vertices, once the path is wide (``spread_threshold``): the outgoing cache with probability
-      :math:`1/(1 + N m^2/v)`, m being its mean error over a region; else as above, incident cache or another bounce.
+      :math:`1/(1 + N m^2/v)`, m being its mean error over a region; else incident cache or another bounce as above.
 
     So the first samples show the caches, more samples trust them less, and E[L_o] tends to the path-traced radiance.
 """

@@ -43,13 +43,14 @@ def squared_bias(first: np.ndarray, second: np.ndarray, reference: Reference) ->
     """Relative squared bias of an estimator from two independent images of it, without the largest 0.1 % of its values.
 
     ``E[(I - R)(I' - R)] = (E I - R)²``: the noise of either image cancels, whatever it is; that of the reference is
-    subtracted as in relMSE. May come out negative where the bias is below what the samples resolve.
+    subtracted as in relMSE. Values are ranked by (I - R)² + (I' - R)², which says nothing of the product's sign. May
+    come out negative where the bias is below what the samples resolve.
     """
     total, noise = relative_squared_errors(0.5 * (first + second), reference.rgb, reference.variance)
     # (I - R)(I' - R) = ((I + I')/2 - R)² - ((I - I')/2)², each weighted as relMSE does
     spread, _ = relative_squared_errors(reference.rgb + 0.5 * (first - second), reference.rgb)
     values = total - spread - noise
-    order = np.argsort(total, axis=None)[: values.size - math.ceil(TRIM_FRACTION * values.size)]
+    order = np.argsort(total + spread, axis=None)[: values.size - math.ceil(TRIM_FRACTION * values.size)]
     return float(values.ravel()[order].mean())
 
 
