@@ -20,9 +20,10 @@ QUERIES = 2.0
 AUTO = """
     With ``termination="auto"``, ``nirc`` and ``nrc`` are one and the same estimator: it has both caches, trained on the
     same paths, and decides at each vertex by their errors, measured while training (no reference, no further rays).
-    Training paths start in twos from the same point, so that the mean of (A - T)(A - T') over pairs of independent
-    estimates is the squared bias of a cache's answer A (b_o², b_i² of the incident one, with noise v_i), and (T - T')²/2
-    the noise v of tracing on, all by cells of 1/16 of the box. For an image of N samples a pixel:
+    Training paths start in twos from the same point. Over such pairs of independent estimates T, T' of one more bounce,
+    the mean of (A - T)(A - T') is the squared bias of a cache's answer A (:math:`b_o^2`; of the incident cache
+    :math:`b_i^2`, its noise :math:`v_i`) and that of (T - T')²/2 the noise v of tracing on, all by cells of 1/16 of the
+    box. For an image of N samples a pixel:
 
     - first vertex: what is traced either ends right there, in the incident cache, or goes on; it is mixed with the
       outgoing cache's answer by the weight of least squared error, :math:`v/N / (v/N + b_o^2)` if it goes on. Of the
