@@ -40,6 +40,7 @@ def test_factor_is_the_rays_of_nrc_at_the_bias_of_nirc():
               Point("nirc", 3, 0.0, 0.01)]  # fmt: skip
     found = factors(points)
     assert found[0]["rays_nrc"] == pytest.approx(0.5) and found[0]["factor"] == pytest.approx(5)
+    assert found[0]["rays_nrc_measured"] == 1
     assert found[1]["rays_nrc"] is None and found[1]["factor"] is None, "out of reach"
     assert found[2]["rays_nrc"] == 0 and found[2]["factor"] == 0
     assert found[3]["rays_nrc"] == pytest.approx(1) and found[3]["factor"] is None, "no ray at all"

@@ -90,23 +90,25 @@ def curve(scene, name: str, keys: dict, thresholds, reference: Reference, sample
 def factors(points: list[Point]) -> list[dict]:
     """For each point of ``nirc``: the rays that ``nrc`` needs for the same squared bias, and the ratio.
 
-    Along the lower envelope of its points, log of the bias linear in the rays. None: it does not reach that bias; 0
-    rays: it has it already where paths stop at once.
+    `rays_nrc`: along the lower envelope of its points, log of the bias linear in the rays; `rays_nrc_measured`: of that
+    point with fewest rays whose bias is no larger. None: it does not reach that bias. `factor`: ratio of the first to
+    the rays of ``nirc``; None where either is missing or ``nirc`` traces none.
     """
     nrc = sorted((p for p in points if p.integrator == "nrc"), key=lambda p: p.rays)
-    rays = np.array([p.rays for p in nrc])
+    rays = [p.rays for p in nrc]
     bias = np.minimum.accumulate([max(p.bias, 1e-12) for p in nrc])
     out = []
     for p in (p for p in points if p.integrator == "nirc"):
-        target, needed = max(p.bias, 1e-12), None
-        if target >= bias[0]:
-            needed = float(rays[0])
-        elif target >= bias[-1]:
+        target, needed, measured = max(p.bias, 1e-12), None, None
+        if target >= bias[-1]:
             k = int(np.argmax(bias <= target))
-            t = (math.log(bias[k - 1]) - math.log(target)) / (math.log(bias[k - 1]) - math.log(bias[k]))
-            needed = float(rays[k - 1] + t * (rays[k] - rays[k - 1]))
+            needed = measured = rays[k]
+        if measured is not None and k > 0:
+            t = math.log(bias[k - 1] / target) / math.log(bias[k - 1] / bias[k])
+            needed = rays[k - 1] + t * (rays[k] - rays[k - 1])
         ratio = needed / p.rays if needed is not None and p.rays > 0 else None
-        out.append({"threshold": p.threshold, "bias": p.bias, "rays": p.rays, "rays_nrc": needed, "factor": ratio})
+        out.append({"threshold": p.threshold, "bias": p.bias, "rays": p.rays, "rays_nrc": needed,
+                    "rays_nrc_measured": measured, "factor": ratio})  # fmt: skip
     return out
 
 
@@ -163,7 +165,9 @@ def main(arguments: list[str] | None = None) -> int:
     exr.write_text(options.output / "results.json", json.dumps(results, indent=1))
     plot(points, loaded.name).savefig(options.output / "curves.png", dpi=120)
     for f in found:
-        needed = "out of reach" if f["rays_nrc"] is None else f"{f['rays_nrc']:.3f} rays"
+        needed = "out of reach"
+        if f["rays_nrc"] is not None:
+            needed = f"{f['rays_nrc']:.3f} rays ({f['rays_nrc_measured']:.3f} the next point measured)"
         ratio = "" if f["factor"] is None else f", {f['factor']:.1f} times as many"
         print(f"nirc, {f['rays']:.3f} rays, squared bias {f['bias']:.5f}: nrc {needed}{ratio}")
     return 0
