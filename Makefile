@@ -32,7 +32,7 @@ picture: demo  ## the README's picture, of the demo's frames
 	    out/demo/path_$(k) out/demo/nirc_$(k))
 
 test: $(STAMP)  ## the default tests, a few minutes on two cores
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal  # of xdist's ways the one that goes on when a process dies
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

@@ -1,16 +1,18 @@
-"""What all tests share: one variant, fixed seeds, fresh interpreters, the scenes beside the checkout.
+"""What all tests share: one variant, fixed seeds, quick kernels, fresh interpreters, the scenes beside the checkout.
 
 The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest` runs the same tests on a GPU.
 """
 
+import gc
 import os
 import random
 import subprocess
 import sys
 from pathlib import Path
 
-import mi_neural  # first: it chooses the LLVM library
+import quick_kernels  # noqa: F401  (first: it chooses how kernels are compiled)
 
+import mi_neural  # isort: skip  (second: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
 import numpy as np
 import pytest
@@ -23,6 +25,10 @@ if text := mi_neural.variant_problem(VARIANT):
 mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
 
 
+def pytest_collection_finish():
+    gc.freeze()  # what is there by now stays: it need not be looked through after every test
+
+
 @pytest.fixture(autouse=True)
 def _same_start_for_every_test():
     mi.set_variant(VARIANT)
@@ -30,6 +36,9 @@ def _same_start_for_every_test():
     np.random.seed(0)  # noqa: NPY002 (for libraries that draw from the global state)
     yield
     mi.set_variant(VARIANT)
+    # Scenes and integrators refer to each other in circles. Those of old tests would be compiled into the calls of the
+    # next ones, being in Dr.Jit's registry, and be freed at any moment of them.
+    gc.collect()
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@
 It renders `path` times 1 + 1 / (1 + frames trained), so that training shows in the image.
 """
 
-import time
 from pathlib import Path
+from time import sleep
 
 import mitsuba as mi
 
@@ -52,7 +52,7 @@ def register() -> None:
         def train_seconds(self, scene, seconds, sensor=0):
             if self.interrupt_train:
                 raise KeyboardInterrupt
-            time.sleep(seconds)
+            sleep(seconds)
             self.frames += 10
             self.seconds += seconds
             return self.statistics()
