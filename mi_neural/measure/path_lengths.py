@@ -2,9 +2,10 @@
 
 Both caches are trained once; then images are made for a row of spread thresholds, from stopping as early as possible to
 hardly ever, and the squared bias of each is drawn over its mean path length, as on the project page of the incident
-cache (Dereviannykh et al. 2025). A path's length is the number of rays that carry reflected light (channel ``depth``,
-less the camera's). Rays that find direct light alone (shadow rays, the BSDF ray that shares the work with them) do not
-count: both integrators trace them at each vertex that does not ask the outgoing cache.
+cache (Dereviannykh et al. 2025). The length is the number of rays that carry reflected light to the first surface that
+is neither mirror nor glass (channel ``depth``, less what ``nrc`` has with c = 0). Rays that find direct light alone
+(shadow rays, the BSDF ray that shares the work with them) do not count: both integrators trace them at each vertex that
+does not ask the outgoing cache.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def squared_bias(first: np.ndarray, second: np.ndarray, reference: Reference) ->
 
 
 def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[float, float]:
-    """(squared bias, rays a sample) of a trained integrator that is not trained on. Each image is planned as one of a
+    """(squared bias, mean depth) of a trained integrator that is not trained on. Each image is planned as one of a
     single sample, so that what depends on the sample count (`adaptive`) stays at its most biased setting."""
     import mitsuba as mi
 
@@ -65,11 +66,11 @@ def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[floa
     names = integrator.aov_names()
     rgb = [np.asarray(i[..., :3], np.float64) for i in images]
     depth = np.mean([i[..., i.shape[-1] - len(names) + names.index("depth")] for i in images], axis=0)
-    return squared_bias(*rgb, reference), float(np.maximum(depth - 1, 0).mean())
+    return squared_bias(*rgb, reference), float(depth.mean())
 
 
 def curve(scene, name: str, keys: dict, thresholds, reference: Reference, samples: int, frames: int) -> list[Point]:
-    """The points of one integrator, its cache trained once by `frames` frames."""
+    """The points of one integrator, its cache trained once by `frames` frames; `rays` is the depth as yet."""
     keys = {"channels": "depth", **keys}
     trained, _ = load.build_integrator(load.IntegratorSpec(name), keys)
     trained.train(scene, frames)
@@ -81,9 +82,9 @@ def curve(scene, name: str, keys: dict, thresholds, reference: Reference, sample
                 load.IntegratorSpec(name), {**keys, "freeze_cache": True, "spread_threshold": threshold}
             )
             integrator.load_cache(Path(folder) / "cache", scene)
-            bias, rays = bias_of(scene, integrator, reference, samples)
-            points.append(Point(name, threshold, rays, bias))
-            print(f"{name:5s} c = {threshold:<8g} {rays:7.3f} rays, squared bias {bias:.5f}", flush=True)
+            bias, depth = bias_of(scene, integrator, reference, samples)
+            points.append(Point(name, threshold, depth, bias))
+            print(f"{name:5s} c = {threshold:<8g} depth {depth:7.3f}, squared bias {bias:.5f}", flush=True)
     return points
 
 
@@ -153,9 +154,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     points: list[Point] = []
-    keys = {"max_depth": options.max_depth}
+    keys, thresholds = {"max_depth": options.max_depth}, sorted({0.0, *options.thresholds})
     for name in INTEGRATORS:
-        points += curve(loaded.scene, name, keys, options.thresholds, reference, options.samples, options.frames)
+        points += curve(loaded.scene, name, keys, thresholds, reference, options.samples, options.frames)
+    first = points[0].rays  # of nrc with c = 0: the rays up to the first surface that is neither mirror nor glass
+    for p in points:
+        p.rays = max(p.rays - first, 0.0)
     found = factors(points)
     options.output.mkdir(parents=True, exist_ok=True)
     results = {
