@@ -35,6 +35,13 @@ AUTO = """
 """
 
 
+def check(integrator) -> None:
+    """Refuse settings that do not go with it."""
+    blend, n_paths = integrator.cache.blend, integrator.cache.training.n_paths
+    integrator._check(blend == "ema", f"blend is '{blend}'; termination 'auto' needs 'ema'")
+    integrator._check(n_paths > 1, f"train_samples is {n_paths}; termination 'auto' needs pairs, at least 2")
+
+
 def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
     """E[L] = Le + w L_o(x_1) + (1 - w) [direct light + what a path gathers that ends in either cache].
 
@@ -46,6 +53,7 @@ def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
     def stop(si, spread, smooth, first, sampler):
         n = mi.Vector3f(si.sh_frame.n)
         share, incident = field.accuracy.choose(si.p, n, n_samples, smooth)
+        incident &= ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)  # whose reflections the cache is not asked for
         wide = smooth & ~first & spread.exceeds(integrator.spread_threshold)
         ends = wide & (sampler.next_1d() < field.accuracy.stops(si.p, n_samples, wide))
         return share, ends, incident & (first | wide) & ~ends

@@ -50,7 +50,7 @@ class NRCIntegrator(CacheIntegrator):
                 message = message.replace(f"{name} is", f"{key} is")
             raise ValueError(f"{self.plugin}: {message}") from None
         if self.termination == "auto":
-            self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; termination 'auto' needs 'ema'")
+            automatic.check(self)
             self.cache = PairCache(training, shared, sizes, self.seed)
         else:
             self.cache = OutgoingCache(

@@ -301,6 +301,7 @@ def test_incident_cache_at_the_first_vertex_is_nirc(trained, box, tmp_path):
 def test_both_plugins_are_one_estimator(trained, box, tmp_path):
     a, b = copy_of(trained, box, tmp_path), copy_of(trained, box, tmp_path, plugin="nirc")
     np.testing.assert_array_equal(render(box, a, 4), render(box, b, 4))
+    assert a.measure_query(2**10) > 0 and b.measure_query(2**10) > 0
 
 
 # ---------------------------------------------------------------- all together
@@ -315,6 +316,23 @@ def test_known_answer_within_two_percent(plugin, sphere):
     image = render(sphere, auto(plugin, train_samples=1024), 16)
     print(f"mean {image.mean():.4f} (known 1)")
     assert abs(image.mean() - 1) < 0.02 and np.abs(image - 1).max() < 0.15
+
+
+def test_mirror_lobes_are_not_left_to_the_incident_cache():
+    """Its directions are those of smooth lobes alone: under plastic, half of what is reflected here, paths go on."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    scene = mi.load_dict({
+        "type": "scene", "lamp": {"type": "point", "position": [0, 0, 0.5], "intensity": 3.0},
+        "room": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": {"type": "plastic", "int_ior": 4.0}}},
+        "sensor": {"type": "perspective", "fov": 60, "to_world": T().look_at([0, 0, -0.9], [0, 0, 1], [0, 1, 0]),
+                   "film": film},
+    })  # fmt: skip
+    integrator = auto(freeze_cache=True)
+    render(scene, integrator, 1)
+    force(integrator, v_i=0.0, b_i=0.0)
+    assert_same_mean(renders(scene, integrator, 16, 32), renders(scene, {"type": "path"}, 16, 64, first_seed=1000),
+                     "plastic", blocks=2, relative=1e-5)  # fmt: skip
 
 
 def test_mix_has_less_error_than_either_part():
@@ -396,6 +414,7 @@ def test_frozen_functions_are_not_recorded_again_and_preparing_changes_nothing(b
     ("nrc", {"cache_content": "indirect"}, "needs cache_content 'reflected'"),
     ("nirc", {"cache_samples": 0}, "cache_samples is 0"),
     ("nrc", {"blend": "fast"}, "blend is 'fast'"),
+    ("nrc", {"train_samples": 1}, "train_samples is 1"),
     ("nirc", {"blend": "reliability"}, "blend is 'reliability'"),
 ])  # fmt: skip
 def test_impossible_combination_is_refused(plugin, keys, message):
