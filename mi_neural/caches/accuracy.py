@@ -32,9 +32,9 @@ LARGEST = 30.0
 LEVEL_EPSILON = 1e-2
 #: Pairs of the whole grid's mean that a cell's own noise starts from. A bias starts from more, see `_finish`.
 PRIOR = 8
-#: A sample that ends in the incident cache takes this many times the time of one that goes on to the outgoing cache
-#: (Sponza, stairwell, room behind a door: 1.3 to 1.5).
-INCIDENT_COST = 1.4
+#: Time of a sample that ends in the incident cache, and of one that asks the outgoing cache at its first vertex as
+#: well, over that of one that does neither.
+INCIDENT_COST, OUTGOING_COST = 1.4, 1.2
 #: The drift of a region without records: paths do not stop there.
 UNKNOWN = 1e30
 #: Shares of the outgoing cache this close to 0 or 1 count as that, so that only one of the two need be evaluated.
@@ -88,6 +88,16 @@ def mix(error, bias, cross):
     total = error + bias - 2 * cross
     w = dr.select(total > 0, dr.clip((error - cross) / dr.maximum(total, 1e-30), 0, 1), 0)
     return w, dr.square(w) * bias + dr.square(1 - w) * error + 2 * w * (1 - w) * cross
+
+
+def _in_equal_time(noise, cost, bias, bias_outgoing, cross):
+    """(w, error): whether and with what weight to mix the outgoing cache's answer with an estimate of these errors, and
+    the squared error that follows in the time of samples of cost 1."""
+    w, _ = mix(noise + bias, bias_outgoing, cross)
+    alone = cost * noise + bias
+    slower = (cost + OUTGOING_COST - 1) * noise + bias
+    mixed = dr.square(w) * bias_outgoing + dr.square(1 - w) * slower + 2 * w * (1 - w) * cross
+    return dr.select(mixed < alone, w, 0), dr.minimum(mixed, alone)
 
 
 class Accuracy:
@@ -157,8 +167,8 @@ class Accuracy:
         i = self._entry(x, normal)
         v, v_i, b_i, b_o, c = (dr.gather(mi.Float, getattr(self, name), i, active) for name in ERRORS)
         inverse = dr.rcp(mi.Float(n_samples))
-        w, error = mix(v * inverse, b_o, 0)
-        w_incident, error_incident = mix(INCIDENT_COST * v_i * inverse + b_i, b_o, c)
+        w, error = _in_equal_time(v * inverse, 1, 0, b_o, 0)
+        w_incident, error_incident = _in_equal_time(v_i * inverse, INCIDENT_COST, b_i, b_o, c)
         incident = error_incident < error
         w = dr.select(incident, w_incident, w)
         return dr.select(w < NEGLIGIBLE, 0, dr.select(w > 1 - NEGLIGIBLE, 1, w)), incident
