@@ -31,8 +31,9 @@ picture: demo  ## the README's picture, of the demo's frames
 	$(BIN)/python -m mi_neural.measure.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
 	    out/demo/path_$(k) out/demo/nirc_$(k))
 
+# Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(STAMP)  ## the default tests, a few minutes on two cores
-	$(BIN)/python -m pytest -n 2 --dist worksteal  # of xdist's ways the one that goes on when a process dies
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

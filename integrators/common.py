@@ -22,6 +22,8 @@ from mi_neural.transport.samples import PathSampler
 
 #: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (measured, README).
 PASS_SAMPLES = 2**20
+#: Neighbouring pixels whose samples lie side by side: the lanes of a packet of AVX-512, half a warp.
+PACKET = 16
 #: Frames that `train_frames = -1` trains at least and at most.
 SETTLE_FRAMES = (128, 400)
 
@@ -119,6 +121,21 @@ def _other_scene(path) -> str:
     )
 
 
+def _opaque(numbers: tuple) -> list:
+    """Numbers as variables, so that no kernel is compiled anew when they change."""
+    return [dr.opaque(mi.Float, v) for v in numbers]
+
+
+def _sums(values: list, first, stride: int, count) -> list:
+    """Sums over the `count` entries ``first + k stride`` of each array."""
+    zeros = tuple(dr.zeros(mi.Float, dr.width(first)) for _ in values)
+
+    def add(k, *sums):
+        return k + 1, *(s + dr.gather(mi.Float, v, first + k * stride) for s, v in zip(sums, values, strict=True))
+
+    return list(dr.while_loop((mi.UInt32(0), *zeros), lambda k, *_: k < count, add, label="samples of a pixel")[1:])
+
+
 def _in_keys(message: str) -> str:
     """A message of the library in the words of the plugin's keys."""
     for name, key in (("n_paths", "train_samples"), ("n_vertices", "train_vertices"), ("n_levels", "levels"),
@@ -211,7 +228,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     # -------------------------------------------------------------------------------------------------------------
     # To be given by the plugin
 
-    def estimate(self, scene, lights, field, sampler, ray, mixture, active):
+    def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """Radiance along camera rays: (L, valid, {channel: value}). `lights` chooses lights; None: the scene itself."""
         raise NotImplementedError(f"{type(self).__name__} must define estimate()")
 
@@ -223,9 +240,9 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Whether the settings can lead to a query at all."""
         return self.max_depth < 0 or self.max_depth > 2
 
-    def mixture(self, spp: int) -> float:
-        """A number that depends on the image's sample count, handed on to `estimate`."""
-        return 0.0
+    def settings(self, spp: int) -> tuple:
+        """Numbers that may change from image to image, handed on to `estimate` as variables; `spp`: the image's."""
+        return ()
 
     @property
     def queries_per_sample(self) -> float:
@@ -472,7 +489,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         border = film.rfilter().border_size() if film.sample_border() else 0
         width, height = int(size[0]) + 2 * border, int(size[1]) + 2 * border
         n_pixels = width * height
-        mixture = dr.opaque(mi.Float, self.mixture(self.state.planned_spp or spp))
+        settings = _opaque(self.settings(self.state.planned_spp or spp))
         box = film.rfilter().is_box_filter()
         field = self.cache.asked if self.needs_cache else None
 
@@ -491,7 +508,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 with undisturbed():
                     pos, values, n_bad = self.state.passes[key](
                         scene, sensor, self.state.lights, field, mi.UInt32(seed & 0xFFFFFFFF),
-                        dr.opaque(mi.UInt32, done), dr.opaque(mi.UInt32, y), mixture,
+                        dr.opaque(mi.UInt32, done), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, n_rows),
+                        dr.opaque(mi.UInt32, y), settings,
                     )  # fmt: skip
                 self.state.nonfinite.append(n_bad)
                 block.set_coalesce(False)
@@ -503,17 +521,28 @@ class CacheIntegrator(mi.SamplingIntegrator):
             dr.eval(self.state.nonfinite)
         return block
 
-    def _frozen_pass(self, width: int, n_rows: int, spp: int, border: int, box: bool, freeze: bool):
-        """A function that renders `spp` samples of some rows and returns what the film's block takes."""
+    def _frozen_pass(self, width: int, n_rows: int, n_samples: int, border: int, box: bool, freeze: bool):
+        """A function that renders `n_samples` samples of some rows and returns what the film's block takes.
 
-        def render_pass(scene, sensor, lights, field, seed, first_sample, first_row, mixture):
-            n = width * n_rows * spp
-            lane = dr.arange(mi.UInt32, n)
-            pixel = lane // spp + first_row * width
-            sample = lane % spp + first_sample
+        A packet of lanes holds one sample each of `PACKET` neighbouring pixels, the next packet the next samples of the
+        same: so lanes that run together may decide together (:meth:`PathSampler.together_1d`), and pixels stay
+        independent of one another in all their samples but that.
+        """
+        n_pixels = width * n_rows
+        n_lanes = -(-n_pixels // PACKET) * PACKET * n_samples
+
+        def render_pass(scene, sensor, lights, field, seed, first_sample, spp, rows, first_row, settings):
+            # `spp` and `rows` are `n_samples` and `n_rows` as variables: one kernel for all sizes of a pass
+            lane = dr.arange(mi.UInt32, n_lanes)
+            packet = lane // PACKET
+            local = packet // spp * PACKET + lane % PACKET
+            active = local < width * rows
+            pixel = local + first_row * width
+            sample = packet % spp + first_sample
             scramble, _ = mi.sample_tea_32(pixel, seed, 4)
+            group, _ = mi.sample_tea_32(pixel // PACKET, seed ^ 0x2545F491, 4)
             sampler = PathSampler.make(
-                pixel + sample * mi.UInt32(0x9E3779B9), seed ^ 0x5BF03635, index=sample, scramble=scramble
+                pixel + sample * mi.UInt32(0x9E3779B9), seed ^ 0x5BF03635, sample, scramble, group
             )
             film = sensor.film()
             corner = mi.Point2f(mi.Float(pixel % width) - border, mi.Float(pixel // width) - border)
@@ -526,23 +555,23 @@ class CacheIntegrator(mi.SamplingIntegrator):
             ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), pos_unit, aperture)
             ray.scale_differential(dr.rsqrt(mi.Float(spp)))
 
-            L, valid, extra = self.estimate(scene, lights, field, sampler, ray, mixture, mi.Bool(True))
+            L, valid, extra = self.estimate(scene, lights, field, sampler, ray, settings, active)
             L *= weight
             ok = dr.all(dr.isfinite(L))
             L = dr.select(ok, L, 0)
             values = [L.x, L.y, L.z]
             if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
                 values.append(dr.select(valid, mi.Float(1), 0))
-            values.append(dr.select(ok, mi.Float(1), 0))
+            values.append(dr.select(ok & active, mi.Float(1), 0))
             for name in self.channels:
                 value = extra[name]
                 values += [value.x, value.y, value.z] if self.CHANNELS[name] == 3 else [mi.Float(value)]
             dr.eval(values, ok)  # one kernel; the sums below would otherwise run the whole estimate again, each
-            n_bad = dr.count(~ok)
+            n_bad = dr.count(~ok & active)
             if box:  # one value a pixel, the sum of its samples
-                if spp > 1:
-                    values = [dr.block_sum(v, spp) for v in values]
-                first = dr.arange(mi.UInt32, width * n_rows) + first_row * width
+                local = dr.arange(mi.UInt32, n_pixels)
+                values = _sums(values, local // PACKET * PACKET * spp + local % PACKET, PACKET, spp)
+                first = local + first_row * width
                 pos = mi.Point2f(mi.Float(first % width) - border, mi.Float(first // width) - border)
                 pos += mi.Point2f(film.crop_offset()) + 0.5
             dr.eval(pos, values, n_bad)
@@ -556,8 +585,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         self.state.images = max(self.state.images, 1)
         lane = mi.UInt32(sampler.next_1d() * 2**24)
         own = PathSampler.make(lane, mi.UInt32(sampler.next_1d() * 2**24))
-        mixture = mi.Float(self.mixture(self.state.planned_spp or sampler.sample_count()))
-        L, valid, extra = self.estimate(scene, self.state.lights, self.cache.asked, own, ray, mixture, mi.Bool(active))
+        settings = _opaque(self.settings(self.state.planned_spp or sampler.sample_count()))
+        L, valid, extra = self.estimate(scene, self.state.lights, self.cache.asked, own, ray, settings, mi.Bool(active))
         aovs = []
         for name in self.channels:
             aovs += list(extra[name]) if self.CHANNELS[name] == 3 else [extra[name]]

@@ -10,6 +10,7 @@ from mi_neural.caches.pair import PairCache
 from mi_neural.integrators import automatic
 from mi_neural.integrators.automatic import AUTO
 from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.integrators.first_vertex import first_vertex
 from mi_neural.transport import termination, vertex
 from mi_neural.transport.samples import PathSampler
 
@@ -67,7 +68,7 @@ class NIRCIntegrator(CacheIntegrator):
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(AA), mi.Point2f(0.5))
-        L, β, ray, si, _, _, active, sampler = self.first_vertex(scene, sampler, ray, mi.Bool(True))
+        L, β, ray, si, _, _, active, sampler = first_vertex(self, scene, sampler, ray, mi.Bool(True))
         bsdf = si.bsdf(ray)
 
         def once(k, mean, square, sampler):
@@ -96,25 +97,27 @@ class NIRCIntegrator(CacheIntegrator):
     def probe(self, field, x, sampler):
         return super().probe(getattr(field, "incident", field), x, sampler)
 
-    def mixture(self, spp: int) -> float:
-        """Share of far light that is gathered: 0 for a single sample a pixel, 1/2 after `gather_half` more."""
+    def settings(self, spp: int) -> tuple:
+        """The image's sample count for ``auto``; else the share of far light that is gathered: with ``adaptive`` 0 for
+        a single sample a pixel, 1/2 after `gather_half` more."""
         if self.termination == "auto":
-            return float(spp)
+            return (float(spp),)
         if self.termination != "adaptive":
-            return {"primary": 0.0, "spread": 1.0, "balanced": 0.0}[self.termination]
+            return ({"primary": 0.0, "spread": 1.0, "balanced": 0.0}[self.termination],)
         more = max(spp - 1, 0)
-        return more / (more + self.gather_half) if more else 0.0
+        return (more / (more + self.gather_half) if more else 0.0,)
 
     # -------------------------------------------------------------------------------------------------------------
 
-    def estimate(self, scene, lights, field, sampler, ray, mixture, active):
+    def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
+        (mixture,) = settings
         if self.termination == "auto":
             L, visible, c = automatic.estimate(self, scene, lights, field, sampler, ray, mixture, active)
             names = {"direct": "traced", "cache": "cached", "depth": "depth", "share": "share"}
             empty = {n: mi.Color3f(0) if k == 3 else mi.Float(0) for n, k in self.CHANNELS.items()}
             return L, visible, empty | {name: c[theirs] for name, theirs in names.items()}
-        L, β, ray, si, depth, visible, active, sampler = self.first_vertex(scene, sampler, ray, active)
+        L, β, ray, si, depth, visible, active, sampler = first_vertex(self, scene, sampler, ray, active)
         bsdf = si.bsdf(ray)
         n_light = self.n_light
         cached = self.needs_cache and field is not None
@@ -194,59 +197,6 @@ class NIRCIntegrator(CacheIntegrator):
         channels |= {"depth": depth + mi.Float(n_rays) / n_light, "share": mi.Float(0)}
         channels |= sigma_channels(field if cached else None, si.p, si.sh_frame.n)
         return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
-
-    def first_vertex(self, scene, sampler, ray, active):
-        """Follow the camera ray through delta surfaces to the first one with a smooth lobe.
-
-        Returns (emission on the way, throughput, last ray, its intersection, segments traced, visible, active,
-        sampler).
-        """
-        ctx = mi.BSDFContext()
-        ray = mi.RayDifferential3f(ray)
-        active = mi.Bool(active)
-        max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
-        active &= max_depth > 0
-
-        if self.hide:
-            pi = self.skip_area_emitters(scene, mi.Ray3f(ray), True, active)
-            si = pi.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, active)
-        else:
-            si = scene.ray_intersect(ray, active)
-        visible = active & si.is_valid()
-        shown = active & (si.is_valid() | (not self.hide))
-        L = vertex.emission(scene, si, shown)
-        visible |= shown & (dr.max(L) > 0)
-        β = dr.select(active & si.is_valid(), mi.Color3f(1), 0)
-
-        def is_delta(si, active):
-            return active & si.is_valid() & ~vertex.has_smooth(si.bsdf())
-
-        # Only a delta surface needs the loop: the others are done
-        chain = is_delta(si, active)
-
-        def bounce(depth, ray, β, L, chain, sampler):
-            si = scene.ray_intersect(ray, chain)
-            seen = chain & (depth > 0)
-            L += dr.select(seen, β * vertex.emission(scene, si, seen), 0)
-            goes_on = is_delta(si, chain)
-            bs, weight = si.bsdf().sample(ctx, si, sampler.next_1d(), sampler.next_2d(), goes_on)
-            β = dr.select(goes_on, β * weight, dr.select(chain & ~si.is_valid(), 0, β))
-            roulette = goes_on & (depth >= max(self.rr_depth, 8))
-            q = dr.minimum(dr.max(β), 0.95)
-            goes_on &= (dr.max(β) > 0) & (depth + 1 < max_depth) & (~roulette | (sampler.next_1d() < q))
-            β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
-            β = dr.select(is_delta(si, chain) & ~goes_on, 0, β)
-            ray = dr.select(goes_on, si.spawn_ray(si.to_world(bs.wo)), ray)
-            return depth + dr.select(goes_on, 1, 0), ray, β, L, goes_on, sampler
-
-        depth, ray, β, L, _, sampler = dr.while_loop(
-            (mi.UInt32(0), mi.Ray3f(ray), β, L, mi.Bool(chain), sampler),
-            lambda depth, ray, β, L, chain, sampler: chain, bounce, label="delta chain",
-        )  # fmt: skip
-        si_chain = scene.ray_intersect(ray, chain & (dr.max(β) > 0))
-        si = dr.select(chain, si_chain, si)
-        active = (dr.max(β) > 0) & si.is_valid() & (depth + 1 < max_depth)
-        return L, β, ray, si, depth + 1, visible, active, sampler
 
     def gather_share(self, delta, pdf, spread, a_0, far):
         """How much of a direction's light is gathered at what it meets, instead of read from the cache here.

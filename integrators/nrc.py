@@ -58,8 +58,8 @@ class NRCIntegrator(CacheIntegrator):
                 reliability=self.cache.reliability,
             )  # fmt: skip
 
-    def mixture(self, spp: int) -> float:
-        return float(spp)
+    def settings(self, spp: int) -> tuple:
+        return (float(spp),)
 
     @property
     def needs_cache(self) -> bool:
@@ -73,10 +73,10 @@ class NRCIntegrator(CacheIntegrator):
 
     # -------------------------------------------------------------------------------------------------------------
 
-    def estimate(self, scene, lights, field, sampler, ray, mixture, active):
+    def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] = path tracing up to the vertex where the spread exceeds that of the pixel, and the cache there."""
         if self.termination == "auto":
-            return automatic.estimate(self, scene, lights, field, sampler, ray, mixture, active)
+            return automatic.estimate(self, scene, lights, field, sampler, ray, settings[0], active)
         cached = self.needs_cache and field is not None
 
         def stop(si, spread, smooth, first, sampler):

@@ -177,11 +177,11 @@ def test_hidden_emitters_are_looked_through_as_path_does(type_):
 
 
 def test_share_of_gathered_light_follows_termination_and_samples():
-    assert [nirc(termination=t).mixture(16) for t in ("primary", "spread", "balanced")] == [0, 1, 0]
-    shares = [nirc(termination="adaptive", gather_half=8.0).mixture(n) for n in (1, 2, 9, 1000, 10**6)]
+    assert [nirc(termination=t).settings(16)[0] for t in ("primary", "spread", "balanced")] == [0, 1, 0]
+    shares = [nirc(termination="adaptive", gather_half=8.0).settings(n)[0] for n in (1, 2, 9, 1000, 10**6)]
     assert shares == sorted(shares) and 0 <= shares[0] < 0.2 and shares[-1] > 0.99
     for n in (1, 2, 16):
-        assert 0 <= nirc(gather_half=0.0).mixture(n) <= 1
+        assert 0 <= nirc(gather_half=0.0).settings(n)[0] <= 1
 
 
 # ---------------------------------------------------------------- emission once; delta chains
@@ -242,7 +242,7 @@ def test_room_of_mirrors_without_a_smooth_surface_renders():
         "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
                    "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}},
     })  # fmt: skip
-    image = render(scene, nirc(train_frames=3), 64)  # a glass ball under a constant sky cannot be seen
+    image = render(scene, nirc(train_frames=3, rr_depth=64), 64)  # a glass ball under a constant sky cannot be seen
     np.testing.assert_allclose(image[..., :3], 0.5, rtol=1e-3)
 
 

@@ -126,7 +126,7 @@ def local_mean(field: Field, features: list, records: TrainingRecords, n: int, s
 def learn(cache: Field | Blend, records: TrainingRecords, training: Training, seed, learning_rate, decay):
     """One training step on the given records; a blend scores its predictors on them first. Returns (loss, mean target,
     mean |prediction|), 1-wide, the means over `scale`."""
-    blend = cache if isinstance(cache, Blend) else None
+    blend = None if isinstance(cache, Field) else cache
     field = cache.field if blend else cache
     n_valid = dr.maximum(dr.count(records.valid), 1)
     y = dr.select(records.valid, dr.clip(records.target / field.scale, 0, TARGET_MAX), 0)
@@ -170,6 +170,8 @@ class IncidentCache:
     SNAPSHOT_EVERY = 64
     #: What is trained, and what blends its two sets of weights.
     FIELD, BLEND = Field, Blend
+    #: What the mean weight of the blend is called in the statistics.
+    MEASURE = "reliability"
 
     def __init__(
         self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0, *, blend: str = "ema",
@@ -224,7 +226,7 @@ class IncidentCache:
             records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
             dr.eval(records, n_bad)
         outputs = learn(cache, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
-        sigma = cache.mean_sigma() if isinstance(cache, Blend) else mi.Float(0)
+        sigma = mi.Float(0) if isinstance(cache, Field) else cache.mean_sigma()
         return *outputs, dr.count(records.valid), n_bad, sigma
 
     def start(self, scene, sensor, lights=None) -> None:
@@ -269,7 +271,7 @@ class IncidentCache:
         s["records"] += int(n_valid)
         s["nonfinite"] += int(n_bad)
         if self.blend != "ema":
-            s["reliability"] = sigma
+            s[self.MEASURE] = sigma
         healthy = self._watch(value, mean_target, mean_prediction)
         if healthy and mean_target > max(self.BRIGHTER, 10 * mean_prediction):
             # Another light: what was measured in the old one is void, and the schedule of rates begins anew

@@ -15,20 +15,22 @@ class PathSampler:
     """Per-lane random numbers of one pass: a PCG32 stream, and the state of the stratified ones.
 
     `index` is the number of the lane's camera sample in its pixel; `scramble` is equal for all samples of a pixel and
-    different between pixels, seeds and whatever else was hashed into it. A PyTree: it may be a loop variable.
+    different between pixels, seeds and whatever else was hashed into it; `group` is equal for pixels whose samples of
+    one index shall decide together, see :meth:`together_1d`. A PyTree: it may be a loop variable.
     """
 
-    DRJIT_STRUCT = {"pcg": object, "index": object, "scramble": object}  # noqa: RUF012
+    DRJIT_STRUCT = {"pcg": object, "index": object, "scramble": object, "group": object}  # noqa: RUF012
 
-    def __init__(self, pcg=None, index=None, scramble=None):
-        self.pcg, self.index, self.scramble = pcg, index, scramble
+    def __init__(self, pcg=None, index=None, scramble=None, group=None):
+        self.pcg, self.index, self.scramble, self.group = pcg, index, scramble, group
 
     @classmethod
-    def make(cls, lane, seed, index=0, scramble=None) -> PathSampler:
+    def make(cls, lane, seed, index=0, scramble=None, group=None) -> PathSampler:
         """A sampler for each entry of `lane` (``mi.UInt32``); equal lanes and `seed` give equal numbers."""
         state, sequence = mi.sample_tea_32(lane, seed, 6)
         pcg = mi.PCG32(size=dr.width(lane), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
-        return cls(pcg, mi.UInt32(index), state if scramble is None else mi.UInt32(scramble))
+        scramble = state if scramble is None else mi.UInt32(scramble)
+        return cls(pcg, mi.UInt32(index), scramble, scramble if group is None else mi.UInt32(group))
 
     def next_1d(self):
         return self.pcg.next_float32()
@@ -44,6 +46,14 @@ class PathSampler:
     def stratified_1d(self, dimension: int, n: int = 1, i=0):
         """As `stratified_2d`, one number."""
         return self.stratified_2d(dimension, n, i).x
+
+    def together_1d(self, dimension):
+        """One number, uniform like any other, and the same for all lanes of a group and index.
+
+        For roulette: lanes of one packet that end together end the packet's work, where one that goes on alone keeps
+        the whole packet busy. Over the indices of a pixel the numbers are stratified. `dimension` may be an array.
+        """
+        return sobol_2d(self.index, _hash(self.group + mi.UInt32(dimension) * 0x85EBCA6B)).x
 
 
 def sobol_2d(index, seed):

@@ -1,0 +1,217 @@
+"""How a camera sample is divided between cache and tracing: chosen by measured variance and time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from dataclasses import asdict, dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_neural.transport import two_level
+from mi_neural.transport.freezing import undisturbed
+
+#: α by place, as a number among the settings.
+BY_PLACE = -1.0
+#: Camera samples of one pass of the pilot, and passes for each candidate.
+PILOT_SAMPLES, PILOT_PASSES = 2**16, 6
+#: Bands of rows that a pilot looks at, over the height of the film.
+BANDS = 4
+#: Share of the pixels with the largest variance that is left out when candidates are compared.
+TRIM = 0.002
+#: How much better than path tracing a division must measure before it is taken: what chance alone may do.
+MARGIN = 1.05
+#: Frames of records that give α by place for a cache that was trained elsewhere.
+LOOK_FRAMES = 32
+
+
+@dataclass(frozen=True)
+class Split:
+    """How a camera sample is divided: `n_cache` directions in which the cache is asked, `n_traced` for direct light, of
+    which each goes on with `probability`, and the coefficient `alpha`, negative: by place."""
+
+    n_cache: int = 0
+    n_traced: int = 1
+    probability: float = 1.0
+    alpha: float = 0.0
+
+    def numbers(self) -> tuple:
+        return float(self.n_traced), float(self.n_cache), float(self.probability), float(self.alpha)
+
+    def __str__(self):
+        if self.alpha == 0 and self.probability == 1:
+            return f"path tracing, {self.n_traced} path{'s' * (self.n_traced > 1)}"
+        alpha = "by place" if self.alpha < 0 else f"{self.alpha:g}"
+        return f"Nc {self.n_cache}, Nr {self.n_traced * self.probability:g}, alpha {alpha}"
+
+
+PATH_TRACING = Split()
+
+
+class Choice:
+    """The division in use. Keys that are given stay; the others are chosen by :meth:`measure`, if there are any.
+
+    Raises ValueError for keys out of range.
+    """
+
+    def __init__(self, cache_samples, residual_samples, residual_probability, alpha):
+        if cache_samples is not None and cache_samples < 0:
+            raise ValueError(f"cache_samples is {cache_samples}; give 0 (path tracing) or more")
+        if residual_samples is not None and residual_samples < 1:
+            raise ValueError(f"residual_samples is {residual_samples}; it must be at least 1; for fewer paths set "
+                             "residual_probability")  # fmt: skip
+        if residual_probability is not None and not 0 < residual_probability <= 1:
+            raise ValueError(f"residual_probability is {residual_probability}; it must lie in (0, 1]")
+        if isinstance(alpha, str) and alpha != "cell":
+            raise ValueError(f"alpha is '{alpha}'; give 'cell' or a number in [0, 1]")
+        if alpha is not None and not isinstance(alpha, str) and not 0 <= alpha <= 1:
+            raise ValueError(f"alpha is {alpha}; give 'cell' or a number in [0, 1]")
+        if cache_samples == 0:
+            if alpha not in (None, 0):
+                raise ValueError(f"alpha is {alpha}, but cache_samples is 0: there is no cache to weigh; leave one out")
+            alpha, residual_probability = 0.0, 1.0 if residual_probability is None else residual_probability
+        self.given = {
+            "n_cache": cache_samples, "n_traced": residual_samples, "probability": residual_probability,
+            "alpha": BY_PLACE if alpha == "cell" else alpha,
+        }  # fmt: skip
+        self.reset()
+
+    @property
+    def fixed(self) -> bool:
+        """Whether all of it was given."""
+        return all(v is not None for v in self.given.values())
+
+    @property
+    def may_ask(self) -> bool:
+        """Whether a division could ask the cache."""
+        return self.given["alpha"] != 0 and self.given["n_cache"] != 0
+
+    def reset(self) -> None:
+        known = {k: v for k, v in self.given.items() if v is not None}
+        if self.may_ask and "n_cache" not in known:
+            known["n_cache"] = 4
+        self.split = Split(**known)
+        self.table: list[dict] = []
+        self.measured_at = -1
+        self.seconds = 0.0
+
+    def candidates(self) -> list[Split]:
+        """Divisions to compare, path tracing first where it is one."""
+        def options(name, choices):
+            return choices if self.given[name] is None else [self.given[name]]
+
+        found = []
+        for a, n, q in itertools.product(
+            options("alpha", [0.0, BY_PLACE] if self.may_ask else [0.0]), options("n_traced", [1, 2, 4]),
+            options("probability", [1.0, 0.5, 0.25]),
+        ):  # fmt: skip
+            if a == 0 and q < 1 and self.given["probability"] is None:
+                continue  # leaving out paths with nothing in their place
+            if a != 0 and n > 2 and self.given["n_traced"] is None:
+                continue
+            found.append(Split(options("n_cache", [4])[0] if a != 0 else 0, n, q, a))
+        return found
+
+    def measure(self, integrator, scene, sensor) -> None:
+        """Compare the candidates on `scene` and take the best; again whenever the cache is twice as old."""
+        steps = integrator.cache.steps
+        if self.measured_at >= 0 and steps < 2 * max(self.measured_at, 1):
+            return
+        start = time.perf_counter()
+        if self.may_ask and integrator.cache.statistics.get("alpha") is None and self.given["alpha"] in (None, BY_PLACE):
+            integrator.cache.look(scene, sensor, integrator.state.lights, LOOK_FRAMES)
+        self.measured_at = steps
+        if not self.fixed:
+            self._compare(Pilot(integrator, scene, sensor))
+        dr.sync_thread()
+        self.seconds += time.perf_counter() - start
+
+    def _compare(self, pilot) -> None:
+        splits = self.candidates()
+        pilot.run(splits[0], passes=1)  # kernels
+        self.table = [pilot.facts(s) for s in splits]
+        if self.given["n_cache"] is None and any(s.alpha != 0 for s in splits):
+            best = self.split_of(min((t for t in self.table if t["alpha"] != 0), key=lambda t: t["cost"]))
+            more = replace(best, n_cache=8)
+            self.table.append(pilot.facts(more))
+            better = replace(best, n_cache=self._n_cache(best, self.table))
+            if better.n_cache not in (4, 8):
+                self.table.append(pilot.facts(better))
+        base = self.table[0]["cost"]
+        for t in self.table:
+            t["efficiency"] = base / t["cost"] if t["cost"] > 0 else math.inf
+        best = max(self.table, key=lambda t: t["efficiency"])
+        self.split = splits[0] if best["efficiency"] < MARGIN else self.split_of(best)
+
+    @staticmethod
+    def split_of(facts: dict) -> Split:
+        return Split(**{k: facts[k] for k in ("n_cache", "n_traced", "probability", "alpha")})
+
+    @staticmethod
+    def _n_cache(best: Split, table: list) -> int:
+        """Nc by `two_level.best_split`, from what 4 and 8 queries a sample gave."""
+        four, eight = (next(t for t in table if Choice.split_of(t) == replace(best, n_cache=n)) for n in (4, 8))
+        var_cache = 8 * max(four["variance"] - eight["variance"], 0.0)
+        cost_cache = max(eight["seconds"] - four["seconds"], 1e-12) / 4
+        var_residual = max(four["variance"] - var_cache / 4, 1e-30)
+        cost_residual = max(four["seconds"] - 4 * cost_cache, 1e-12)
+        ratio = two_level.best_split(var_cache, cost_cache, var_residual, cost_residual)
+        return int(min(max(round(ratio * best.n_traced * best.probability), 2), 16))
+
+    def statistics(self) -> dict:
+        facts = {"split": str(self.split), "seconds_pilot": self.seconds}
+        return facts | ({"pilot": self.table} if self.table else {})
+
+
+class Pilot:
+    """Variance and time of divisions of a camera sample, on bands of rows of the film."""
+
+    def __init__(self, integrator, scene, sensor):
+        self.integrator, self.scene, self.sensor = integrator, scene, sensor
+        film = sensor.film()
+        film.prepare(integrator.aov_names())
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        width, height = (int(v) + 2 * border for v in film.crop_size())
+        self.rows = max(1, min(height // BANDS, PILOT_SAMPLES // (2 * BANDS * width)))
+        self.first = [int((k + 0.5) * height / BANDS - self.rows / 2) for k in range(BANDS if height >= BANDS else 1)]
+        self.spp = max(1, min(16, PILOT_SAMPLES // (width * self.rows * len(self.first))))
+        self.run_pass = integrator._frozen_pass(
+            width, self.rows, self.spp, border, True, integrator.cache.freezes(sensor)
+        )
+        self.samples = width * self.rows * self.spp * len(self.first)
+
+    def run(self, split: Split, passes: int = PILOT_PASSES):
+        """(luminance by pass and pixel, seconds of each pass)."""
+        it = self.integrator
+        settings = [dr.opaque(mi.Float, v) for v in split.numbers()]
+        images, seconds = [], []
+        for k in range(passes):
+            dr.sync_thread()
+            t0 = time.perf_counter()
+            bands = []
+            for y in self.first:
+                with undisturbed():
+                    _, values, _ = self.run_pass(
+                        self.scene, self.sensor, it.state.lights, it.cache.asked, mi.UInt32(0x9107 + k),
+                        dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, self.spp), dr.opaque(mi.UInt32, self.rows),
+                        dr.opaque(mi.UInt32, y), settings,
+                    )  # fmt: skip
+                bands.append(mi.luminance(mi.Color3f(*values[:3])) / self.spp)
+            dr.eval(bands)
+            dr.sync_thread()
+            seconds.append(time.perf_counter() - t0)
+            images.append(np.concatenate([np.array(b) for b in bands]))
+        return np.stack(images), seconds
+
+    def facts(self, split: Split) -> dict:
+        """A division with its mean relative variance of one camera sample, seconds a sample, and their product."""
+        images, seconds = self.run(split)
+        mean, variance = images.mean(axis=0), images.var(axis=0, ddof=1) * self.spp
+        floor = 0.01 * max(float(mean.mean()), 1e-30) ** 2
+        relative = np.sort(variance / (mean**2 + floor))
+        relative = float(relative[: max(1, int(relative.size * (1 - TRIM)))].mean())
+        each = float(np.median(seconds)) / self.samples
+        return asdict(split) | {"variance": relative, "seconds": each, "cost": relative * each}

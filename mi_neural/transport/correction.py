@@ -1,0 +1,81 @@
+"""A biased image, corrected scale by scale by what an unbiased one says.
+
+With B a biased image of little noise and D an estimate of E[U - B], whose mean is minus the bias and whose variance is
+known,
+
+    I = B + g Σ_s w_s h_s,        D / g = Σ_s h_s,        w_s = (1 - κ Var[h_s] / <h_s²>)_+
+
+h_s are differences of the relative correction D/g between neighbouring scales, the coarsest being its mean over the
+image; <h²> is their local mean square. What stands out of the noise is corrected: a cache that is everywhere too dark
+after a sample a pixel, fine detail after many. All w_s tend to 1, and I to the unbiased image, as the variance falls
+(shrinkage of James and Stein, by scale and place). Pure NumPy: nothing here knows a renderer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: κ: by how much the energy at a scale must exceed that of its noise, which is known but roughly.
+CAUTION = 1.5
+#: Part of the image's mean level that g has everywhere, so that dark places are not divided by nothing.
+FLOOR = 0.02
+
+
+def box_mean(values: np.ndarray, radius: int) -> np.ndarray:
+    """Means over squares of ``2 radius + 1`` pixels, cut at the borders; shape (height, width, channels)."""
+    if radius <= 0:
+        return values
+    for axis in (0, 1):
+        n = values.shape[axis]
+        sums = np.concatenate([np.zeros_like(np.take(values, [0], axis)), np.cumsum(values, axis)], axis)
+        i = np.arange(n)
+        high, low = np.minimum(i + radius + 1, n), np.maximum(i - radius, 0)
+        count = (high - low).reshape([-1 if a == axis else 1 for a in range(values.ndim)])
+        values = (np.take(sums, high, axis) - np.take(sums, low, axis)) / count
+    return values
+
+
+def smooth(values: np.ndarray, radius: int) -> np.ndarray:
+    """Two box means, which have no edges to be seen."""
+    return box_mean(box_mean(values, radius), radius)
+
+
+def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, caution: float = CAUTION) -> np.ndarray:
+    """The part of `difference` that stands out of its noise.
+
+    `difference` and its `variance`: shape (height, width, channels); `level`: positive, of the same shape, what the
+    correction is thought relative to. Returns `difference` itself where the variance is 0, and 0 where it is not finite.
+    """
+    ok = np.isfinite(difference) & np.isfinite(variance)
+    g = np.maximum(level, 0) + max(FLOOR * float(level.mean()), 1e-30)
+    v = np.where(ok, variance, 0) / g**2
+    r = np.where(ok, difference, 0) / g
+    # Noisy pixels count less; by the noise of their neighbourhood, since a pixel's own depends on its value
+    spread = box_mean(v, 3)
+    weight = np.where(ok, 1 / (spread + 0.1 * spread.mean() + 1e-30), 0)
+
+    def average(radius):
+        w = smooth(weight, radius)
+        mean = smooth(weight * r, radius) / np.maximum(w, 1e-300)
+        # Two box means of radius R weigh as one square of (2R + 1)² * 9/4 pixels
+        n = min((2 * radius + 1) ** 2 * 2.25 if radius else 1.0, r.shape[0] * r.shape[1])
+        return mean, smooth(weight**2 * v, radius) / np.maximum(w, 1e-300) ** 2 / n
+
+    scales = [0]
+    while 2 ** len(scales) < min(r.shape[:2]) // 2:
+        scales.append(2 ** (len(scales) - 1))
+    means = [average(s) for s in scales]
+    total = np.sum(weight * r, axis=(0, 1), keepdims=True) / np.sum(weight, axis=(0, 1), keepdims=True)
+    total_var = np.sum(weight**2 * v, axis=(0, 1), keepdims=True) / np.sum(weight, axis=(0, 1), keepdims=True) ** 2
+    means.append((np.broadcast_to(total, r.shape), np.broadcast_to(total_var, r.shape)))
+    out = _shrunk(*means[-1], means[-1][0] ** 2, caution)
+    for k in range(len(scales)):
+        (fine, var_fine), (coarse, var_coarse) = means[k], means[k + 1]
+        h = fine - coarse
+        energy = box_mean(h**2, max(2 * scales[k], 2))
+        out = out + _shrunk(h, np.maximum(var_fine - var_coarse, 0), energy, caution)
+    return np.where(ok, out * g, 0)
+
+
+def _shrunk(h, noise, energy, caution):
+    return h * np.maximum(1 - caution * noise / np.maximum(energy, 1e-300), 0)
