@@ -13,22 +13,33 @@ from mi_neural.caches.incident import reflect
 from mi_neural.integrators import prefix
 from mi_neural.transport.suffixes import surface_of
 
+#: Queries a camera sample, at its first vertex and at its end; fewer where only one of them is asked, more where the
+#: end is in the incident cache.
+QUERIES = 2.0
 #: For the class docstrings of the plugins that offer it.
 AUTO = """
     With ``termination="auto"``, ``nirc`` and ``nrc`` are one and the same estimator: it has both caches, trained on the
     same paths, and decides at each vertex by their errors, measured while training (no reference, no further rays).
-    Training paths start in twos from the same point, so that the mean of (A - T)(A - T') over pairs of independent
-    estimates is the squared bias of a cache's answer A, and (T - T')²/2 the noise v of tracing on, both by cells of
-    1/16 of the box. For an image of N samples a pixel:
+    Training paths start in twos from the same point. Over such pairs of independent estimates T, T' of one more bounce,
+    the mean of (A - T)(A - T') is the squared bias of a cache's answer A (:math:`b_o^2`; of the incident cache
+    :math:`b_i^2`, its noise :math:`v_i`) and that of (T - T')²/2 the noise v of tracing on, all by cells of 1/16 of the
+    box. For an image of N samples a pixel:
 
-    - first vertex: the outgoing cache's answer with the weight :math:`v/N / (v/N + b_o^2)`, the mix of least squared
-      error; what is traced beside it ends right there in the incident cache if :math:`1.4 v_i/N + b_i^2 < v/N` (1.4:
-      its cost), else it goes on.
+    - first vertex: what is traced either ends right there, in the incident cache, or goes on; it is mixed with the
+      outgoing cache's answer by the weight of least squared error, :math:`v/N / (v/N + b_o^2)` if it goes on. Of the
+      two, that one whose mix has the smaller error in equal time.
     - later vertices, once the path is wide (``spread_threshold``): the outgoing cache with probability
-      :math:`1/(1 + N m^2/v)`, m being its mean error over a region; else as above, incident cache or another bounce.
+      :math:`1/(1 + N m^2/v)`, m being its mean error over a region; else incident cache or another bounce as above.
 
     So the first samples show the caches, more samples trust them less, and E[L_o] tends to the path-traced radiance.
 """
+
+
+def check(integrator) -> None:
+    """Refuse settings that do not go with it."""
+    blend, n_paths = integrator.cache.blend, integrator.cache.training.n_paths
+    integrator._check(blend == "ema", f"blend is '{blend}'; termination 'auto' needs 'ema'")
+    integrator._check(n_paths > 1, f"train_samples is {n_paths}; termination 'auto' needs pairs, at least 2")
 
 
 def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
@@ -42,6 +53,7 @@ def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
     def stop(si, spread, smooth, first, sampler):
         n = mi.Vector3f(si.sh_frame.n)
         share, incident = field.accuracy.choose(si.p, n, n_samples, smooth)
+        incident &= ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)  # whose reflections the cache is not asked for
         wide = smooth & ~first & spread.exceeds(integrator.spread_threshold)
         ends = wide & (sampler.next_1d() < field.accuracy.stops(si.p, n_samples, wide))
         return share, ends, incident & (first | wide) & ~ends

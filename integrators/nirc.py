@@ -38,7 +38,7 @@ class NIRCIntegrator(CacheIntegrator):
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
         self._check(self.gather_half >= 0, f"gather_half is {self.gather_half}; it must be 0 or more")
         if self.termination == "auto":
-            self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; termination 'auto' needs 'ema'")
+            automatic.check(self)
             self._check(self.cache_samples > 0, "cache_samples is 0; termination 'auto' needs at least 1")
             training = OutgoingTraining.like(self.cache.training, threshold=self.spread_threshold)
             self.cache = PairCache(
@@ -51,6 +51,8 @@ class NIRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
+        if self.termination == "auto":
+            return automatic.QUERIES if self.needs_cache else 0.0
         return 0.0 if not self.needs_cache else max(self.cache_samples, self.n_light)
 
     @property
@@ -91,6 +93,9 @@ class NIRCIntegrator(CacheIntegrator):
         noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
         self.state.facts["direct_noise"] = float(noise)
         self.state.facts["light_samples"] = 1 if noise < 0.02 else 2 if noise < 0.08 else 4
+
+    def probe(self, field, x, sampler):
+        return super().probe(getattr(field, "incident", field), x, sampler)
 
     def settings(self, spp: int) -> tuple:
         """The image's sample count for ``auto``; else the share of far light that is gathered: with ``adaptive`` 0 for

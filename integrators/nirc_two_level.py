@@ -320,4 +320,91 @@ NIRCTwoLevelIntegrator.CHANNELS = {
     "direct": 3, "cache": 3, "residual": 3, "alpha": 1, "variance_cache": 3, "variance_residual": 3,
     "variance_indirect": 3,
 }  # fmt: skip
+NIRCTwoLevelIntegrator.__doc__ = (
+    r"""
+    .. _integrator-nirc_two_level:
+
+    Two-level estimator with a neural incident radiance cache (:monosp:`nirc_two_level`)
+    ------------------------------------------------------------------------------------
+
+    Estimates all light without bias, whatever the cache says: at the first surface that is not a mirror, direct light is
+    traced as in ``path``, indirect light is the cache's answer and the traced difference to it (Dereviannykh et al.
+    2025, "Neural Two-Level Monte Carlo Real-Time Rendering", the two-level estimator):
+
+    .. math:: L_o = L_e + L_{direct} + \frac{1}{N_c} \sum_i \frac{\alpha L_{cache}(x, \omega_i) f \cos\theta_i}{p(\omega_i)}
+              + \frac{1}{N_r} \sum_j \frac{(L - \alpha L_{cache})(x, \omega_j) f \cos\theta_j}{p(\omega_j)}.
+
+    :math:`E[L_o]` does not depend on the cache: trained, untrained or nonsense, it changes the variance alone. Emission
+    met by a BSDF ray carries its MIS weight and is no part of the sums; mirrors and sharp lobes are always traced.
+
+    On a CPU a query costs a tenth to a third of a path, and most of the variance lies in the paths' far ends, of which
+    the cache knows nothing. So this integrator *measures*: what is not given of the four keys that divide a camera
+    sample is chosen by a pilot, which renders some rows with each division and takes the one of least variance times
+    time; path tracing is among them, at its own cost. ``statistics()["pilot"]`` shows the numbers. Numbers of the first
+    vertex are stratified over a pixel's samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide
+    together where paths end.
+
+    .. pluginparameters::
+
+     * - mode
+       - |string|
+       - ``unbiased``, or ``progressive``: half of the samples are those of ``nirc``, which share the cache, and the
+         image is theirs plus that part of the unbiased one's difference, scale by scale, that stands out of its noise;
+         biased, and consistent: it tends to the unbiased image. For "the best image in T seconds". (Default: unbiased)
+     * - cache_samples
+       - |int|
+       - Directions :math:`N_c` in which the cache is asked per camera sample, those that are traced included. 0: path
+         tracing. (Default: measured)
+     * - residual_samples
+       - |int|
+       - Directions that are traced for direct light, and of which :math:`N_r` go on. (Default: measured, 1, 2 or 4)
+     * - residual_probability
+       - |float|
+       - Probability, in (0, 1], with which a traced direction goes on beyond direct light: :math:`N_r` is this times
+         ``residual_samples``. (Default: measured, 1, 1/2 or 1/4)
+     * - alpha
+       - |string| or |float|
+       - Coefficient of the control variate: a number in [0, 1], 1 being the paper's choice and 0 path tracing; or
+         ``cell``: by place, Cov(y, f)/Var(f) over the training records of earlier frames, cut to [0, 1]. (Default:
+         measured, 0 or ``cell``)
+     * - every_vertex
+       - |bool|
+       - Use the cache as a control variate at each vertex of the residual path, too, with two queries a vertex.
+         (Default: false)
+     * - ris
+       - |bool|
+       - Choose the one traced direction among the ``cache_samples`` that were asked, in proportion to f cos L plus a
+         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Costs more
+         time than it saves noise in the scenes measured (README). (Default: false)
+    """
+    + SHARED_KEYS.strip("\n")
+    + r"""
+
+    Channels: ``direct``, ``cache`` (its part of the sum, with α), ``residual`` (RGB each; with visible emission they
+    sum to the image of mode ``unbiased``), ``alpha``; ``variance_cache``, ``variance_residual``,
+    ``variance_indirect`` (RGB each): sample variances of one camera sample; over the number of samples they are
+    the variance of the pixel.
+
+    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
+    participating media (use ``volpath``), polarization, spectral rendering, ``blend`` (use ``nirc``).
+    ``share_cache(other)`` goes on with the cache of a ``nirc``; cache files of either can be read by both.
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    :class:`~mi_neural.caches.field.CacheFileError` for cache files.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nirc_two_level">
+                <string name="mode" value="progressive"/>
+                <emitter type="nvc_lights" name="light_sampler"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            integrator = mi.load_dict({"type": "nirc_two_level", "cache_samples": 4, "alpha": 1.0})
+            image = mi.render(scene, integrator=integrator, spp=64)
+            print(integrator.statistics()["split"])
+    """
+)
 mi.register_integrator("nirc_two_level", lambda props: NIRCTwoLevelIntegrator(props))

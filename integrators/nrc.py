@@ -50,7 +50,7 @@ class NRCIntegrator(CacheIntegrator):
                 message = message.replace(f"{name} is", f"{key} is")
             raise ValueError(f"{self.plugin}: {message}") from None
         if self.termination == "auto":
-            self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; termination 'auto' needs 'ema'")
+            automatic.check(self)
             self.cache = PairCache(training, shared, sizes, self.seed)
         else:
             self.cache = OutgoingCache(
@@ -67,7 +67,9 @@ class NRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
-        return 1.0 if self.needs_cache else 0.0
+        if not self.needs_cache:
+            return 0.0
+        return automatic.QUERIES if self.termination == "auto" else 1.0
 
     # -------------------------------------------------------------------------------------------------------------
 

@@ -2,9 +2,10 @@
 
 Both caches are trained once; then images are made for a row of spread thresholds, from stopping as early as possible to
 hardly ever, and the squared bias of each is drawn over its mean path length, as on the project page of the incident
-cache (Dereviannykh et al. 2025). A path's length is the number of rays that carry reflected light (channel ``depth``,
-less the camera's). Rays that find direct light alone (shadow rays, the BSDF ray that shares the work with them) do not
-count: both integrators trace them at each vertex that does not ask the outgoing cache.
+cache (Dereviannykh et al. 2025). The length is the number of rays that carry reflected light to the first surface that
+is neither mirror nor glass (channel ``depth``, less what ``nrc`` has with c = 0). Rays that find direct light alone
+(shadow rays, the BSDF ray that shares the work with them) do not count: both integrators trace them at each vertex that
+does not ask the outgoing cache.
 """
 
 from __future__ import annotations
@@ -43,18 +44,19 @@ def squared_bias(first: np.ndarray, second: np.ndarray, reference: Reference) ->
     """Relative squared bias of an estimator from two independent images of it, without the largest 0.1 % of its values.
 
     ``E[(I - R)(I' - R)] = (E I - R)²``: the noise of either image cancels, whatever it is; that of the reference is
-    subtracted as in relMSE. May come out negative where the bias is below what the samples resolve.
+    subtracted as in relMSE. Values are ranked by (I - R)² + (I' - R)², which says nothing of the product's sign. May
+    come out negative where the bias is below what the samples resolve.
     """
     total, noise = relative_squared_errors(0.5 * (first + second), reference.rgb, reference.variance)
     # (I - R)(I' - R) = ((I + I')/2 - R)² - ((I - I')/2)², each weighted as relMSE does
     spread, _ = relative_squared_errors(reference.rgb + 0.5 * (first - second), reference.rgb)
     values = total - spread - noise
-    order = np.argsort(total, axis=None)[: values.size - math.ceil(TRIM_FRACTION * values.size)]
+    order = np.argsort(total + spread, axis=None)[: values.size - math.ceil(TRIM_FRACTION * values.size)]
     return float(values.ravel()[order].mean())
 
 
 def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[float, float]:
-    """(squared bias, rays a sample) of a trained integrator that is not trained on. Each image is planned as one of a
+    """(squared bias, mean depth) of a trained integrator that is not trained on. Each image is planned as one of a
     single sample, so that what depends on the sample count (`adaptive`) stays at its most biased setting."""
     import mitsuba as mi
 
@@ -64,11 +66,11 @@ def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[floa
     names = integrator.aov_names()
     rgb = [np.asarray(i[..., :3], np.float64) for i in images]
     depth = np.mean([i[..., i.shape[-1] - len(names) + names.index("depth")] for i in images], axis=0)
-    return squared_bias(*rgb, reference), float(np.maximum(depth - 1, 0).mean())
+    return squared_bias(*rgb, reference), float(depth.mean())
 
 
 def curve(scene, name: str, keys: dict, thresholds, reference: Reference, samples: int, frames: int) -> list[Point]:
-    """The points of one integrator, its cache trained once by `frames` frames."""
+    """The points of one integrator, its cache trained once by `frames` frames; `rays` is the depth as yet."""
     keys = {"channels": "depth", **keys}
     trained, _ = load.build_integrator(load.IntegratorSpec(name), keys)
     trained.train(scene, frames)
@@ -80,32 +82,34 @@ def curve(scene, name: str, keys: dict, thresholds, reference: Reference, sample
                 load.IntegratorSpec(name), {**keys, "freeze_cache": True, "spread_threshold": threshold}
             )
             integrator.load_cache(Path(folder) / "cache", scene)
-            bias, rays = bias_of(scene, integrator, reference, samples)
-            points.append(Point(name, threshold, rays, bias))
-            print(f"{name:5s} c = {threshold:<8g} {rays:7.3f} rays, squared bias {bias:.5f}", flush=True)
+            bias, depth = bias_of(scene, integrator, reference, samples)
+            points.append(Point(name, threshold, depth, bias))
+            print(f"{name:5s} c = {threshold:<8g} depth {depth:7.3f}, squared bias {bias:.5f}", flush=True)
     return points
 
 
 def factors(points: list[Point]) -> list[dict]:
     """For each point of ``nirc``: the rays that ``nrc`` needs for the same squared bias, and the ratio.
 
-    Along the lower envelope of its points, log of the bias linear in the rays. None: it does not reach that bias; 0
-    rays: it has it already where paths stop at once.
+    `rays_nrc`: along the lower envelope of its points, log of the bias linear in the rays; `rays_nrc_measured`: of that
+    point with fewest rays whose bias is no larger. None: it does not reach that bias. `factor`: ratio of the first to
+    the rays of ``nirc``; None where either is missing or ``nirc`` traces none.
     """
     nrc = sorted((p for p in points if p.integrator == "nrc"), key=lambda p: p.rays)
-    rays = np.array([p.rays for p in nrc])
+    rays = [p.rays for p in nrc]
     bias = np.minimum.accumulate([max(p.bias, 1e-12) for p in nrc])
     out = []
     for p in (p for p in points if p.integrator == "nirc"):
-        target, needed = max(p.bias, 1e-12), None
-        if target >= bias[0]:
-            needed = float(rays[0])
-        elif target >= bias[-1]:
+        target, needed, measured = max(p.bias, 1e-12), None, None
+        if target >= bias[-1]:
             k = int(np.argmax(bias <= target))
-            t = (math.log(bias[k - 1]) - math.log(target)) / (math.log(bias[k - 1]) - math.log(bias[k]))
-            needed = float(rays[k - 1] + t * (rays[k] - rays[k - 1]))
+            needed = measured = rays[k]
+        if measured is not None and k > 0:
+            t = math.log(bias[k - 1] / target) / math.log(bias[k - 1] / bias[k])
+            needed = rays[k - 1] + t * (rays[k] - rays[k - 1])
         ratio = needed / p.rays if needed is not None and p.rays > 0 else None
-        out.append({"threshold": p.threshold, "bias": p.bias, "rays": p.rays, "rays_nrc": needed, "factor": ratio})
+        out.append({"threshold": p.threshold, "bias": p.bias, "rays": p.rays, "rays_nrc": needed,
+                    "rays_nrc_measured": measured, "factor": ratio})  # fmt: skip
     return out
 
 
@@ -150,9 +154,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     points: list[Point] = []
-    keys = {"max_depth": options.max_depth}
+    keys, thresholds = {"max_depth": options.max_depth}, sorted({0.0, *options.thresholds})
     for name in INTEGRATORS:
-        points += curve(loaded.scene, name, keys, options.thresholds, reference, options.samples, options.frames)
+        points += curve(loaded.scene, name, keys, thresholds, reference, options.samples, options.frames)
+    first = points[0].rays  # of nrc with c = 0: the rays up to the first surface that is neither mirror nor glass
+    for p in points:
+        p.rays = max(p.rays - first, 0.0)
     found = factors(points)
     options.output.mkdir(parents=True, exist_ok=True)
     results = {
@@ -162,7 +169,9 @@ def main(arguments: list[str] | None = None) -> int:
     exr.write_text(options.output / "results.json", json.dumps(results, indent=1))
     plot(points, loaded.name).savefig(options.output / "curves.png", dpi=120)
     for f in found:
-        needed = "out of reach" if f["rays_nrc"] is None else f"{f['rays_nrc']:.3f} rays"
+        needed = "out of reach"
+        if f["rays_nrc"] is not None:
+            needed = f"{f['rays_nrc']:.3f} rays ({f['rays_nrc_measured']:.3f} the next point measured)"
         ratio = "" if f["factor"] is None else f", {f['factor']:.1f} times as many"
         print(f"nirc, {f['rays']:.3f} rays, squared bias {f['bias']:.5f}: nrc {needed}{ratio}")
     return 0
