@@ -6,7 +6,7 @@ import numpy as np
 
 from mi_neural.caches.control import ControlCache
 from mi_neural.integrators import pilot, progressive
-from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
 from mi_neural.integrators.first_vertex import first_vertex
 from mi_neural.integrators.pilot import Split
 from mi_neural.integrators.progressive import UNBIASED, Parts
@@ -327,11 +327,12 @@ NIRCTwoLevelIntegrator.__doc__ = (
     Two-level estimator with a neural incident radiance cache (:monosp:`nirc_two_level`)
     ------------------------------------------------------------------------------------
 
-    Estimates all light without bias, whatever the cache says: at the first surface that is not a mirror, direct light is
-    traced as in ``path``, indirect light is the cache's answer and the traced difference to it (Dereviannykh et al.
+    Estimates all light without bias, whatever the cache says: at the first surface that is not a mirror, direct light
+    is traced as in ``path``, indirect light is the cache's answer and the traced difference to it (Dereviannykh et al.
     2025, "Neural Two-Level Monte Carlo Real-Time Rendering", the two-level estimator):
 
-    .. math:: L_o = L_e + L_{direct} + \frac{1}{N_c} \sum_i \frac{\alpha L_{cache}(x, \omega_i) f \cos\theta_i}{p(\omega_i)}
+    .. math:: L_o = L_e + L_{direct}
+              + \frac{1}{N_c} \sum_i \frac{\alpha L_{cache}(x, \omega_i) f \cos\theta_i}{p(\omega_i)}
               + \frac{1}{N_r} \sum_j \frac{(L - \alpha L_{cache})(x, \omega_j) f \cos\theta_j}{p(\omega_j)}.
 
     :math:`E[L_o]` does not depend on the cache: trained, untrained or nonsense, it changes the variance alone. Emission
