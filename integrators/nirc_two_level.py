@@ -27,7 +27,7 @@ TOGETHER = 16
 
 class NIRCTwoLevelIntegrator(CacheIntegrator):
     def __init__(self, props):
-        self.choice = self.mixed = None
+        self.choice, self.mixed, self.compiling = None, None, False
         super().__init__(props)
         self.mode = props.get("mode", "unbiased")
         self.every_vertex = props.get("every_vertex", False)
@@ -85,11 +85,43 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         super()._ready(scene, sensor, train)
-        if self.needs_cache and self.cache.field is not None and not self.state.image_open:
+        worth = self.choice.rendered >= pilot.WORTH and train and not self.state.image_open
+        if self.needs_cache and self.mixed is None and (worth or self.compiling):
             self.choice.measure(self, scene, sensor)
 
+    def measure(self, scene, sensor=0) -> dict:
+        """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""
+        sensor = self._sensor(scene, sensor)
+        self._ready(scene, sensor, train=False)
+        if self.needs_cache:
+            with dr.suspend_grad():
+                self.choice.measure(self, scene, sensor)
+        return self.statistics()
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
+        sensor = self._sensor(scene, sensor)
+        size, expected = sensor.film().crop_size(), self.state.planned_spp or spp or sensor.sampler().sample_count()
+        before, pixels = self.choice.rendered, int(size[0]) * int(size[1])
+        self.choice.rendered += expected * pixels
+        result = super().render(scene, sensor, seed, spp, develop, evaluate)
+        self.choice.rendered = before + (spp or sensor.sampler().sample_count()) * pixels
+        return result
+
+    def prepare(self, scene, sensor=0, spp: int = 1) -> None:
+        """Compile all that a render call with `spp` needs. What was learned and measured so far stays as it is."""
+        known, self.compiling = self.choice.state(), True
+        try:
+            super().prepare(scene, sensor, spp)
+        finally:
+            self.compiling = False
+        self.choice.restore(known)
+        if self.mixed is not None:
+            self.mixed.begin()
+
     def train_fraction(self, seconds: float) -> float:
-        return super().train_fraction(seconds) if self.mixed is not None or not self.choice.fixed else 0.1
+        # The unbiased estimate gains little from a better cache, if it asks it at all
+        return super().train_fraction(seconds) * (1.0 if self.mixed is not None else 0.3)
 
     def statistics(self) -> dict:
         return super().statistics() | self.choice.statistics()

@@ -17,13 +17,18 @@ from mi_neural.transport.freezing import undisturbed
 #: α by place, as a number among the settings.
 BY_PLACE = -1.0
 #: Camera samples of one pass of the pilot, and passes for each candidate.
-PILOT_SAMPLES, PILOT_PASSES = 2**16, 6
+PILOT_SAMPLES, PILOT_PASSES = 2**14, 4
+#: Camera samples that must be rendered with a division before it is worth while to look for the best.
+WORTH = 2**22
 #: Bands of rows that a pilot looks at, over the height of the film.
 BANDS = 4
 #: Share of the pixels with the largest variance that is left out when candidates are compared.
 TRIM = 0.002
-#: How much better than path tracing a division must measure before it is taken: what chance alone may do.
-MARGIN = 1.05
+#: How much better than path tracing a division must measure, twice, before it is taken: what chance alone may do.
+MARGIN = 1.08
+#: A first division that asks the cache and costs this many times path tracing's variance times time: the others of its
+#: kind are not measured (in eight scenes none was ever the best then).
+HOPELESS = 1.25
 #: Frames of records that give α by place for a cache that was trained elsewhere.
 LOOK_FRAMES = 32
 
@@ -96,23 +101,30 @@ class Choice:
         self.split = Split(**known)
         self.table: list[dict] = []
         self.measured_at = -1
+        self.rendered = 0  # camera samples, those of the image under way included
         self.seconds = 0.0
+
+    def state(self) -> tuple:
+        """All that measuring changes, for :meth:`restore`."""
+        return self.split, self.table, self.measured_at, self.seconds
+
+    def restore(self, state: tuple) -> None:
+        self.split, self.table, self.measured_at, self.seconds = state
 
     def candidates(self) -> list[Split]:
         """Divisions to compare, path tracing first where it is one."""
+
         def options(name, choices):
             return choices if self.given[name] is None else [self.given[name]]
 
+        alphas = options("alpha", [0.0, BY_PLACE] if self.may_ask else [0.0])
         found = []
-        for a, n, q in itertools.product(
-            options("alpha", [0.0, BY_PLACE] if self.may_ask else [0.0]), options("n_traced", [1, 2, 4]),
-            options("probability", [1.0, 0.5, 0.25]),
-        ):  # fmt: skip
-            if a == 0 and q < 1 and self.given["probability"] is None:
-                continue  # leaving out paths with nothing in their place
-            if a != 0 and n > 2 and self.given["n_traced"] is None:
-                continue
-            found.append(Split(options("n_cache", [4])[0] if a != 0 else 0, n, q, a))
+        for a in alphas:
+            # Without a cache nothing stands in for paths left out; with one, splitting was never worth more than twice
+            paths = options("n_traced", [1, 2, 4] if a == 0 else [1, 2])
+            shares = options("probability", [1.0] if a == 0 else [1.0, 0.5, 0.25])
+            n_cache = options("n_cache", [4])[0] if a != 0 else 0
+            found += [Split(n_cache, n, q, a) for n, q in itertools.product(paths, shares) if (n, q) != (2, 0.25)]
         return found
 
     def measure(self, integrator, scene, sensor) -> None:
@@ -133,28 +145,37 @@ class Choice:
     def _compare(self, pilot) -> None:
         splits = self.candidates()
         pilot.run(splits[0], passes=1)  # kernels
-        self.table = [pilot.facts(s) for s in splits]
-        if self.given["n_cache"] is None and any(s.alpha != 0 for s in splits):
-            best = self.split_of(min((t for t in self.table if t["alpha"] != 0), key=lambda t: t["cost"]))
-            more = replace(best, n_cache=8)
-            self.table.append(pilot.facts(more))
-            better = replace(best, n_cache=self._n_cache(best, self.table))
-            if better.n_cache not in (4, 8):
-                self.table.append(pilot.facts(better))
+        self.table = []
+        for split in splits:
+            asking = [t for t in self.table if t["alpha"] != 0]
+            if asking and splits[0].alpha == 0 and asking[0]["cost"] > HOPELESS * self.table[0]["cost"]:
+                break
+            self.table.append(pilot.facts(split))
+        asking = [t for t in self.table if t["alpha"] != 0] if split is splits[-1] else []
+        if self.given["n_cache"] is None and asking:
+            best = self.split_of(min(asking, key=lambda t: t["cost"]))
+            eight = pilot.facts(replace(best, n_cache=8))
+            self.table.append(eight)
+            n_cache = self._n_cache(best, next(t for t in asking if self.split_of(t) == best), eight)
+            if n_cache not in (4, 8):
+                self.table.append(pilot.facts(replace(best, n_cache=n_cache)))
         base = self.table[0]["cost"]
         for t in self.table:
             t["efficiency"] = base / t["cost"] if t["cost"] > 0 else math.inf
         best = max(self.table, key=lambda t: t["efficiency"])
-        self.split = splits[0] if best["efficiency"] < MARGIN else self.split_of(best)
+        self.split = splits[0]
+        if best["efficiency"] >= MARGIN:
+            again = pilot.facts(splits[0], first_seed=1)["cost"], pilot.facts(self.split_of(best), first_seed=1)["cost"]
+            if again[0] >= MARGIN * again[1]:
+                self.split = self.split_of(best)
 
     @staticmethod
     def split_of(facts: dict) -> Split:
         return Split(**{k: facts[k] for k in ("n_cache", "n_traced", "probability", "alpha")})
 
     @staticmethod
-    def _n_cache(best: Split, table: list) -> int:
+    def _n_cache(best: Split, four: dict, eight: dict) -> int:
         """Nc by `two_level.best_split`, from what 4 and 8 queries a sample gave."""
-        four, eight = (next(t for t in table if Choice.split_of(t) == replace(best, n_cache=n)) for n in (4, 8))
         var_cache = 8 * max(four["variance"] - eight["variance"], 0.0)
         cost_cache = max(eight["seconds"] - four["seconds"], 1e-12) / 4
         var_residual = max(four["variance"] - var_cache / 4, 1e-30)
@@ -179,17 +200,20 @@ class Pilot:
         self.rows = max(1, min(height // BANDS, PILOT_SAMPLES // (2 * BANDS * width)))
         self.first = [int((k + 0.5) * height / BANDS - self.rows / 2) for k in range(BANDS if height >= BANDS else 1)]
         self.spp = max(1, min(16, PILOT_SAMPLES // (width * self.rows * len(self.first))))
-        self.run_pass = integrator._frozen_pass(
-            width, self.rows, self.spp, border, True, integrator.cache.freezes(sensor)
-        )
+        key = (id(scene), id(sensor), width, self.rows, self.spp, True, border)
+        if key not in integrator.state.passes:
+            integrator.state.passes[key] = integrator._frozen_pass(
+                width, self.rows, self.spp, border, True, integrator.cache.freezes(sensor)
+            )
+        self.run_pass = integrator.state.passes[key]
         self.samples = width * self.rows * self.spp * len(self.first)
 
-    def run(self, split: Split, passes: int = PILOT_PASSES):
+    def run(self, split: Split, passes: int = PILOT_PASSES, first_seed: int = 0):
         """(luminance by pass and pixel, seconds of each pass)."""
         it = self.integrator
         settings = [dr.opaque(mi.Float, v) for v in split.numbers()]
         images, seconds = [], []
-        for k in range(passes):
+        for k in range(first_seed * passes, (first_seed + 1) * passes):
             dr.sync_thread()
             t0 = time.perf_counter()
             bands = []
@@ -207,9 +231,9 @@ class Pilot:
             images.append(np.concatenate([np.array(b) for b in bands]))
         return np.stack(images), seconds
 
-    def facts(self, split: Split) -> dict:
+    def facts(self, split: Split, first_seed: int = 0) -> dict:
         """A division with its mean relative variance of one camera sample, seconds a sample, and their product."""
-        images, seconds = self.run(split)
+        images, seconds = self.run(split, first_seed=first_seed)
         mean, variance = images.mean(axis=0), images.var(axis=0, ddof=1) * self.spp
         floor = 0.01 * max(float(mean.mean()), 1e-30) ** 2
         relative = np.sort(variance / (mean**2 + floor))

@@ -12,6 +12,11 @@ BIASED, UNBIASED = ("cache", "residual"), ("cache", "residual", "variance_cache"
                                            "variance_indirect")  # fmt: skip
 #: Keys that the biased estimator has in common with the whole.
 SHARED = ("max_depth", "rr_depth", "hide_emitters", "seed", "levels", "hashmap_size", "width", "hidden_layers")
+#: Least and largest share of unbiased samples, and biased ones that come first.
+SHARES, FIRST_BIASED = (1 / 16, 1 / 2), 4
+
+#: A correction is found anew once there are so many times its samples, and when so much of the image is there.
+AGAIN, NEARLY = 1.5, 0.9
 
 
 class Parts:
@@ -74,8 +79,10 @@ class Parts:
 class Mixed:
     """Samples of both estimators of one image, and the image that they give together.
 
-    Half of an image's samples are those of ``nirc``, which shares the cache and the light sampler, half those of the
-    two-level estimator. Direct light is the same in both, so that all samples count for it.
+    Some of an image's samples are those of ``nirc``, which shares the cache and the light sampler, the others those of
+    the two-level estimator: half of them in an image of one call; in one of several calls each is of one kind, and the
+    more unbiased ones the better the bias is seen in their noise. Direct light is the same in both, so that all samples
+    count for it.
     """
 
     def __init__(self, integrator, props):
@@ -90,6 +97,8 @@ class Mixed:
         """A new image."""
         self.n_biased = self.n_unbiased = 0
         self.biased, self.unbiased = Parts(), Parts()
+        self.share = SHARES[0]
+        self.found, self.found_at = None, 0  # the correction, and the number of samples that it was made of
 
     def reset(self) -> None:
         self.begin()
@@ -100,7 +109,7 @@ class Mixed:
         if spp is None or not self.planned:
             self.begin()
         self.planned = spp is not None
-        self.nirc.state.planned_spp = None if spp is None else max(1, spp // 2)
+        self.nirc.state.planned_spp = spp
 
     def add(self, scene, sensor, seed: int, spp: int, render) -> None:
         """Take `spp` more samples a pixel; ``render(seed, spp)`` gives a block of unbiased ones."""
@@ -110,17 +119,30 @@ class Mixed:
             self.begin()
         if not nirc.state.facts:
             nirc.settle(scene, sensor)
-        # Half each; an odd one goes to the part that has fewer, a first one to the biased
-        n_biased = spp // 2 + (spp % 2 if self.n_biased <= self.n_unbiased else 0)
+        if self.planned:
+            wants = self.n_unbiased < self.share * (self.n_biased + self.n_unbiased)
+            n_biased = 0 if wants and self.n_biased >= FIRST_BIASED else spp
+        else:
+            n_biased = spp - spp // 2
+            nirc.state.planned_spp = n_biased
         if n_biased:
-            if not self.planned:
-                nirc.state.planned_spp = n_biased
             self.biased.add(Parts.of(nirc._render(scene, sensor, seed, n_biased), BIASED, nirc))
             self.n_biased += n_biased
         if spp > n_biased:
             block = render(seed ^ 0x3C6EF372, spp - n_biased)
             self.unbiased.add(Parts.of(block, self.integrator.inner_channels, self.integrator))
             self.n_unbiased += spp - n_biased
+        if not self.planned:
+            nirc.state.planned_spp = None
+
+    def _look(self, n: int) -> None:
+        """Find the correction anew, of `n` samples; and the share of unbiased ones by how much of what they differ is
+        bias, and how much noise."""
+        biased, unbiased = self.biased.indirect, self.unbiased.indirect
+        variance = self.unbiased.variance("indirect", self.n_unbiased) / self.n_unbiased
+        self.found, self.found_at = correction(unbiased - biased, variance, biased), n
+        bias = float(np.mean(self.found**2))
+        self.share = float(np.clip(bias / max(float(np.mean(variance)), 1e-30), *SHARES))
 
     def parts(self) -> Parts:
         """The image so far: the unbiased part's channels with the colour of both."""
@@ -139,7 +161,8 @@ class Mixed:
 
     def indirect(self) -> np.ndarray:
         """Indirect light: the biased estimate, corrected by what stands out of the noise of the unbiased one."""
-        biased, unbiased, n = self.biased.indirect, self.unbiased.indirect, self.n_unbiased
-        if n < 2:
-            return biased
-        return biased + correction(unbiased - biased, self.unbiased.variance("indirect", n) / n, biased)
+        n = self.n_biased + self.n_unbiased
+        due = not self.planned or n >= AGAIN * self.found_at or n >= NEARLY * (self.nirc.state.planned_spp or 0)
+        if self.n_unbiased > 1 and due:
+            self._look(n)
+        return self.biased.indirect + (0 if self.found is None else self.found)

@@ -82,6 +82,13 @@ class Accumulator:
         self.nonfinite += n_bad
         self.spp += spp
 
+    def replace(self, image: np.ndarray, spp: int) -> None:
+        """Add a film that already stands for all passes so far, `spp` more samples a pixel included."""
+        spp, nonfinite = spp + self.spp, self.nonfinite
+        self.__init__()
+        self.add(image, spp)
+        self.nonfinite += nonfinite
+
     def mean(self) -> np.ndarray:
         """The mean so far, float32; black where no pass was finite."""
         return (self.total / np.maximum(self.weight, 1.0)).astype(np.float32)
@@ -253,9 +260,10 @@ def render_seconds(
             if size is None and run.film.spp:
                 break
             size = size or sizes[0]
-            if times:  # samples that the finished image will have
-                known = max(times)
-                run.plan(run.film.spp + max(size, round((seconds - elapsed) / times[known] * known)))
+            # Samples that the finished image will have, as far as is known
+            known = max(times, default=size)
+            expected = round((seconds - elapsed) / times[known] * known) if times else size
+            run.plan(run.film.spp + max(size, expected))
             times[size] = run.one_pass(size)
     except KeyboardInterrupt:
         run.interrupted = True
@@ -313,7 +321,8 @@ class _Run:
         trained_before = statistics(self.integrator).get("seconds_train", 0.0)
         start = clock()
         seed = pass_seed(self.seed, STREAM_IMAGE, self.n_passes)
-        self.film.add(render_pass(self.scene, self.integrator, spp, seed, self.sensor), spp)
+        take = self.film.replace if getattr(self.integrator, "cumulative", False) else self.film.add
+        take(render_pass(self.scene, self.integrator, spp, seed, self.sensor), spp)
         self.n_passes += 1
         seconds = clock() - start
         trained = min(max(0.0, statistics(self.integrator).get("seconds_train", 0.0) - trained_before), seconds)

@@ -3,20 +3,23 @@
 With B a biased image of little noise and D an estimate of E[U - B], whose mean is minus the bias and whose variance is
 known,
 
-    I = B + g Σ_s w_s h_s,        D / g = Σ_s h_s,        w_s = (1 - κ Var[h_s] / <h_s²>)_+
+    I = B + g Σ_s w_s h_s,     D / g = Σ_s h_s,     w_s = (1 - 1/e_s)_+ ramp(e_s; κ, 2κ),     e_s = <h_s² / Var[h_s]>
 
 h_s are differences of the relative correction D/g between neighbouring scales, the coarsest being its mean over the
-image; <h²> is their local mean square. What stands out of the noise is corrected: a cache that is everywhere too dark
-after a sample a pixel, fine detail after many. All w_s tend to 1, and I to the unbiased image, as the variance falls
-(shrinkage of James and Stein, by scale and place). Pure NumPy: nothing here knows a renderer.
+image, and e_s the energy at a place over that of its noise. What stands out of the noise is corrected: a cache that is
+everywhere too dark after a few samples a pixel, fine detail after many. All w_s tend to 1, and I to the unbiased image,
+as the variance falls (shrinkage of James and Stein by scale and place, with a threshold, since the noise of paths can
+be a hundred times the bias). Pure NumPy: nothing here knows a renderer.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-#: κ: by how much the energy at a scale must exceed that of its noise, which is known but roughly.
-CAUTION = 1.5
+#: κ: by how much the energy at a scale must exceed that of its noise, which is known but roughly, to count at all.
+CAUTION = 2.0
+#: Radius over which g is smoothed: the noise of B in it would make the mean of D/g too large.
+LEVEL_RADIUS = 2
 #: Part of the image's mean level that g has everywhere, so that dark places are not divided by nothing.
 FLOOR = 0.02
 
@@ -25,13 +28,13 @@ def box_mean(values: np.ndarray, radius: int) -> np.ndarray:
     """Means over squares of ``2 radius + 1`` pixels, cut at the borders; shape (height, width, channels)."""
     if radius <= 0:
         return values
-    for axis in (0, 1):
-        n = values.shape[axis]
-        sums = np.concatenate([np.zeros_like(np.take(values, [0], axis)), np.cumsum(values, axis)], axis)
+    for _ in range(2):  # columns, then, transposed, rows
+        n = len(values)
+        sums = np.zeros((n + 1, *values.shape[1:]))
+        np.cumsum(values, axis=0, out=sums[1:])
         i = np.arange(n)
         high, low = np.minimum(i + radius + 1, n), np.maximum(i - radius, 0)
-        count = (high - low).reshape([-1 if a == axis else 1 for a in range(values.ndim)])
-        values = (np.take(sums, high, axis) - np.take(sums, low, axis)) / count
+        values = ((sums[high] - sums[low]) / (high - low).reshape(-1, 1, 1)).swapaxes(0, 1)
     return values
 
 
@@ -48,11 +51,13 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
     finite.
     """
     ok = np.isfinite(difference) & np.isfinite(variance)
-    g = np.maximum(level, 0) + max(FLOOR * float(level.mean()), 1e-30)
+    g = smooth(np.maximum(level, 0), LEVEL_RADIUS) + max(FLOOR * float(level.mean()), 1e-30)
     v = np.where(ok, variance, 0) / g**2
     r = np.where(ok, difference, 0) / g
-    # Noisy pixels count less; by the noise of their neighbourhood, since a pixel's own depends on its value
+    # One weight for all channels. Noisy pixels count less; by the noise of their neighbourhood, since a pixel's own depends on its value
+    v = v.mean(axis=-1, keepdims=True)
     spread = box_mean(v, 3)
+    ok = ok.all(axis=-1, keepdims=True)
     weight = np.where(ok, 1 / (spread + 0.1 * spread.mean() + 1e-30), 0)
 
     def average(radius):
@@ -68,15 +73,21 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
     means = [average(s) for s in scales]
     total = np.sum(weight * r, axis=(0, 1), keepdims=True) / np.sum(weight, axis=(0, 1), keepdims=True)
     total_var = np.sum(weight**2 * v, axis=(0, 1), keepdims=True) / np.sum(weight, axis=(0, 1), keepdims=True) ** 2
-    means.append((np.broadcast_to(total, r.shape), np.broadcast_to(total_var, r.shape)))
-    out = _shrunk(*means[-1], means[-1][0] ** 2, caution)
+    means.append((np.broadcast_to(total, r.shape), np.broadcast_to(total_var, v.shape)))
+    out = means[-1][0] * _weight(_square(means[-1][0]) / np.maximum(means[-1][1], 1e-30), caution)
     for k in range(len(scales)):
         (fine, var_fine), (coarse, var_coarse) = means[k], means[k + 1]
         h = fine - coarse
-        energy = box_mean(h**2, max(2 * scales[k], 2))
-        out = out + _shrunk(h, np.maximum(var_fine - var_coarse, 0), energy, caution)
+        # Both over a window: a single bright path is in the differences of all its neighbours
+        radius = 2 * max(scales[k], 1)
+        noise = smooth(np.maximum(var_fine - var_coarse, 0), radius)
+        out = out + h * _weight(smooth(_square(h) / np.maximum(noise, 1e-30), radius), caution)
     return np.where(ok, out * g, 0)
 
 
-def _shrunk(h, noise, energy, caution):
-    return h * np.maximum(1 - caution * noise / np.maximum(energy, 1e-300), 0)
+def _square(h):
+    return np.mean(h**2, axis=-1, keepdims=True)
+
+
+def _weight(energy, caution):
+    return np.maximum(1 - 1 / np.maximum(energy, 1), 0) * np.clip(energy / caution - 1, 0, 1)
