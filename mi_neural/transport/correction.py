@@ -60,7 +60,7 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
         mean = smooth(weight * r, radius) / np.maximum(w, 1e-300)
         # Two box means of radius R weigh as one square of (2R + 1)² * 9/4 pixels
         n = min((2 * radius + 1) ** 2 * 2.25 if radius else 1.0, r.shape[0] * r.shape[1])
-        return mean, smooth(weight**2 * v, radius) / np.maximum(w, 1e-300) ** 2 / n
+        return mean, smooth(weight**2 * v, radius) / np.maximum(w**2, 1e-300) / n
 
     scales = [0]
     while 2 ** len(scales) < min(r.shape[:2]) // 2:
@@ -79,4 +79,5 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
 
 
 def _shrunk(h, noise, energy, caution):
-    return h * np.maximum(1 - caution * noise / np.maximum(energy, 1e-300), 0)
+    stands_out = energy > caution * noise
+    return h * np.where(stands_out, 1 - caution * noise / np.where(stands_out, energy, 1), 0)
