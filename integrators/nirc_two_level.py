@@ -88,6 +88,11 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         super().load_cache(path, scene)
         self.choice.reset()
 
+    def _meet(self, scene, is_another: bool) -> None:
+        super()._meet(scene, is_another)
+        if is_another and self.mixed is not None:
+            self.mixed.nirc.state.passes.clear()
+
     def _ready(self, scene, sensor, train: bool = True) -> None:
         super()._ready(scene, sensor, train)
         if self.needs_cache and self.cache.field is not None and not self.state.image_open:
