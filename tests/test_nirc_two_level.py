@@ -667,6 +667,15 @@ def test_one_sample_gives_an_image(box, poor):
         assert image.mean() > 0 and mixed.n_biased + mixed.n_unbiased == spp and mixed.n_biased >= 1
 
 
+@SLOW
+def test_recordings_of_another_scene_are_not_kept(box, sphere):
+    integrator = two_level(mode="progressive", train_frames=2)
+    for scene in (box, sphere, box):
+        render(scene, integrator, 4)
+        assert len(integrator.mixed.nirc.state.passes) == 1 and integrator.mixed.n_biased == 2
+        assert integrator.cache.steps == 2
+
+
 def test_calls_of_one_image_are_one_image(bench, box, poor):
     """Between plan_samples(n) and plan_samples(None) each call shows all samples so far; then a new image begins."""
     integrator, known = poor[0], bench.reference("cornell_box").mean(axis=0)
