@@ -82,6 +82,16 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         self._check(field.shape == self.cache.shape, f"its cache is of {field.shape}, this one of {self.cache.shape}; "
                     "give both the same sizes")  # fmt: skip
         self.cache.adopt(field)
+        self.choice.reset()
+
+    def load_cache(self, path, scene=None) -> None:
+        super().load_cache(path, scene)
+        self.choice.reset()
+
+    def _meet(self, scene, is_another: bool) -> None:
+        super()._meet(scene, is_another)
+        if is_another and self.mixed is not None:
+            self.mixed.nirc.state.passes.clear()
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         super()._ready(scene, sensor, train)
@@ -168,10 +178,10 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         # ----------- How far the cache is believed here; where its terms would cancel, it is not asked
         α, features = mi.Float(0), None
         if self.needs_cache and field is not None:
-            cancels = (n_cache <= n_traced) & (probability >= 1) if not self.ris else mi.Bool(False)
+            cancels = (n_cache <= n_traced) & (probability >= 1)
             asked = active & vertex.has_smooth(bsdf) & ~cancels
             α = self.coefficient(field, si, alpha, asked)
-            asked &= α > 0 if not self.ris else mi.Bool(True)
+            asked &= (α > 0) | (mi.Bool(self.ris) & (n_cache > 1))
             features = field.encode(si.p, si.sh_frame.n, asked)
         else:
             asked = mi.Bool(False)
@@ -221,7 +231,9 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         zero = mi.Color3f(0)
         direct, cache, residual = mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero)
         if self.ris:
-            cache, kept, sampler = self.resampled(candidate, field, mi.UInt32(n_cache), sampler, active)
+            # One candidate is kept as it is: path tracing
+            n_candidates = mi.UInt32(dr.maximum(n_cache, 1))
+            cache, kept, sampler = self.resampled(candidate, field, n_candidates, sampler, active)
             _, direct, _, residual, sampler = traced_sample(mi.UInt32(0), direct, zero, residual, sampler, kept)
         else:
             _, direct, cache, residual, sampler = dr.while_loop(

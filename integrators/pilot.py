@@ -181,7 +181,7 @@ class Choice:
         var_residual = max(four["variance"] - var_cache / 4, 1e-30)
         cost_residual = max(four["seconds"] - 4 * cost_cache, 1e-12)
         ratio = two_level.best_split(var_cache, cost_cache, var_residual, cost_residual)
-        return int(min(max(round(ratio * best.n_traced * best.probability), 2), 16))
+        return round(min(max(ratio * best.n_traced * best.probability, 2), 16))
 
     def statistics(self) -> dict:
         facts = {"split": str(self.split), "seconds_pilot": self.seconds}
@@ -229,7 +229,7 @@ class Pilot:
             dr.sync_thread()
             seconds.append(time.perf_counter() - t0)
             images.append(np.concatenate([np.array(b) for b in bands]))
-        return np.stack(images), seconds
+        return np.stack(images).astype(np.float64), seconds  # squares of what is dim are 0 in single precision
 
     def facts(self, split: Split, first_seed: int = 0) -> dict:
         """A division with its mean relative variance of one camera sample, seconds a sample, and their product."""

@@ -87,7 +87,7 @@ class Mixed:
 
     def __init__(self, integrator, props):
         self.integrator = integrator
-        self.nirc = mi.load_dict({"type": "nirc", **{k: props[k] for k in SHARED if props.has_property(k)}})
+        self.nirc = mi.load_dict({"type": "nirc", **{k: props[k] for k in SHARED if k in props}})
         self.nirc.channels = list(BIASED)
         self.nirc.cache = integrator.cache
         self.planned = False

@@ -63,6 +63,7 @@ ENTRANTS: dict[str, Entrant] = {
     "nirc": Entrant({"type": "nirc", **SMALL}, biased=True),
     "nirc blend": Entrant({"type": "nirc", "blend": "reliability", **SMALL, "train_frames": 160}, biased=True),
     "nrc": Entrant({"type": "nrc", **SMALL}, biased=True),
+    "nirc_two_level": Entrant({"type": "nirc_two_level", **SMALL}),
 }
 REFERENCES = {
     "path": Entrant({"type": "path", **PATH}),

@@ -13,7 +13,7 @@ import stress
 from hard_cases import CASES, Case, room
 
 SHORT = ("radiance 1e-6", "radiance 1e6", "far from the origin", "lights off", "albedo 1", "NaN in a texture")
-INTEGRATORS = ("plain_path", "nirc")
+INTEGRATORS = ("plain_path", "nirc", "nirc_two_level")
 REFUSED = [name for name, case in CASES.items() if case.refusal]
 
 
@@ -51,7 +51,7 @@ def test_image_of_a_hard_case_is_finite_and_as_bright_as_it_must_be(case, name, 
     assert ok, text
 
 
-@pytest.mark.parametrize("name", ["plain_path", "nvc_direct", "restir_di", "nirc", "nrc"])
+@pytest.mark.parametrize("name", ["plain_path", "nvc_direct", "restir_di", "nirc", "nrc", "nirc_two_level"])
 def test_what_cannot_be_rendered_is_refused_in_one_line_by_every_integrator(name):
     for case in REFUSED:
         found = stress.cell(CASES[case], stress.ENTRANTS[name], 1)

@@ -108,3 +108,55 @@ def test_equal_lanes_and_seeds_give_equal_numbers():
 
     assert (draw(1) == draw(1)).all()
     assert (draw(1) != draw(2)).mean() > 0.99
+
+
+# ---------------------------------------------------------------- numbers of a group
+
+
+def together(pixels, samples, dimension=0, packet=16, seed=1) -> np.ndarray:
+    """`together_1d` of samples `samples` of pixels `pixels`, `packet` of which are a group."""
+    pixels, samples = np.broadcast_arrays(np.uint32(pixels), np.uint32(samples))
+    group, _ = mi.sample_tea_32(mi.UInt32(pixels.ravel() // packet), mi.UInt32(seed), 4)
+    scramble, _ = mi.sample_tea_32(mi.UInt32(pixels.ravel()), mi.UInt32(seed), 4)
+    sampler = PathSampler.make(
+        dr.arange(mi.UInt32, pixels.size), seed, mi.UInt32(samples.ravel()), scramble, group
+    )
+    return np.array(sampler.together_1d(dimension), dtype=np.float64).reshape(pixels.shape)
+
+
+def test_numbers_are_equal_in_a_group_and_independent_between_groups_dimensions_and_seeds():
+    found = together(np.arange(64)[:, None], np.arange(32)).reshape(4, 16, 32)
+    assert (found == found[:, :1]).all()
+    for k in range(3):
+        assert (found[k, 0] == found[k + 1, 0]).mean() < 0.05
+    for other in (together(0, np.arange(32), dimension=1), together(0, np.arange(32), seed=2)):
+        assert (found[0, 0] == other).mean() < 0.05
+
+
+@pytest.mark.parametrize("sample", [0, 3, 1000])
+@pytest.mark.parametrize("dimension", [7, 40])
+def test_numbers_of_groups_are_uniform_and_so_are_pairs_of_dimensions(sample, dimension):
+    """A number decides about a path together with others of the same sample: another dimension, the stratified ones."""
+    pixels = np.arange(N)
+    x = together(pixels, sample, dimension, packet=1)
+    y = together(pixels, sample, dimension + 1, packet=1)
+    assert_uniform(x, y, f"sample {sample}, dimensions {dimension}, {dimension + 1}")
+    for other in (dimension, 2):
+        assert_uniform(x, points(pixels, sample, other)[0], f"dimension {dimension} and stratified {other}")
+
+
+@pytest.mark.parametrize("k", [1, 3, 6])
+def test_numbers_of_a_pixel_are_stratified_over_its_samples(k):
+    for dimension in (7, 20):
+        found = together(5, 2**k + np.arange(2**k), dimension)
+        assert np.unique(np.floor(found * 2**k)).size == 2**k
+
+
+def test_dimension_of_each_lane_may_be_its_own():
+    """Paths of one packet stand at different depths."""
+    lane = dr.arange(mi.UInt32, 64)
+    sampler = PathSampler.make(lane, 1, index=mi.UInt32(3), scramble=lane, group=mi.UInt32(9))
+    found = np.array(sampler.together_1d(lane % 4))
+    for d in range(4):
+        assert (found[d::4] == np.array(sampler.together_1d(d))[0]).all()
+    assert np.unique(found).size == 4

@@ -117,6 +117,11 @@ class ControlCache(IncidentCache):
         super().__init__(training, shape, seed, blend="control")
         self._look = dr.freeze(self._look_plain, auto_opaque=False)
 
+    def adopt(self, field: Field) -> None:
+        """Go on from a field that was trained before, of which no α is known yet."""
+        super().adopt(field)
+        self.statistics.pop(self.MEASURE, None)
+
     def _look_plain(self, scene, sensor, lights, cache, seed):
         records, _ = trace_records(scene, sensor, cache, self.training, seed, lights)
         dr.eval(records)

@@ -54,7 +54,8 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
     g = smooth(np.maximum(level, 0), LEVEL_RADIUS) + max(FLOOR * float(level.mean()), 1e-30)
     v = np.where(ok, variance, 0) / g**2
     r = np.where(ok, difference, 0) / g
-    # One weight for all channels. Noisy pixels count less; by the noise of their neighbourhood, since a pixel's own depends on its value
+    # One weight for all channels. Noisy pixels count less; by the noise of their neighbourhood, since a pixel's own
+    # depends on its value
     v = v.mean(axis=-1, keepdims=True)
     spread = box_mean(v, 3)
     ok = ok.all(axis=-1, keepdims=True)
@@ -65,7 +66,7 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
         mean = smooth(weight * r, radius) / np.maximum(w, 1e-300)
         # Two box means of radius R weigh as one square of (2R + 1)² * 9/4 pixels
         n = min((2 * radius + 1) ** 2 * 2.25 if radius else 1.0, r.shape[0] * r.shape[1])
-        return mean, smooth(weight**2 * v, radius) / np.maximum(w, 1e-300) ** 2 / n
+        return mean, smooth(weight**2 * v, radius) / np.maximum(w**2, 1e-300) / n
 
     scales = [0]
     while 2 ** len(scales) < min(r.shape[:2]) // 2:
