@@ -95,9 +95,12 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         super()._ready(scene, sensor, train)
-        worth = self.choice.rendered >= pilot.WORTH and train and not self.state.image_open
-        if self.needs_cache and self.mixed is None and (worth or self.compiling):
-            self.choice.measure(self, scene, sensor)
+        if not self.needs_cache or self.state.image_open or not (train or self.compiling):
+            return
+        with dr.suspend_grad():
+            self.choice.know_alpha(self, scene, sensor, self.split.alpha < 0)
+            if self.mixed is None and (self.choice.rendered >= pilot.WORTH or self.compiling):
+                self.choice.measure(self, scene, sensor)
 
     def measure(self, scene, sensor=0) -> dict:
         """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""

@@ -127,17 +127,20 @@ class Choice:
             found += [Split(n_cache, n, q, a) for n, q in itertools.product(paths, shares) if (n, q) != (2, 0.25)]
         return found
 
+    def know_alpha(self, integrator, scene, sensor, by_place: bool) -> None:
+        """See that there is an α by place, where one is asked for: a cache from elsewhere has none yet."""
+        if by_place and self.may_ask and integrator.cache.statistics.get("alpha") is None:
+            integrator.cache.look(scene, sensor, integrator.state.lights, LOOK_FRAMES)
+
     def measure(self, integrator, scene, sensor) -> None:
         """Compare the candidates on `scene` and take the best; again whenever the cache is twice as old."""
         steps = integrator.cache.steps
         if self.measured_at >= 0 and steps < 2 * max(self.measured_at, 1):
             return
         start = time.perf_counter()
-        by_place = self.may_ask and self.given["alpha"] in (None, BY_PLACE)
-        if by_place and integrator.cache.statistics.get("alpha") is None:  # a cache that was trained elsewhere
-            integrator.cache.look(scene, sensor, integrator.state.lights, LOOK_FRAMES)
         self.measured_at = steps
         if not self.fixed:
+            self.know_alpha(integrator, scene, sensor, self.given["alpha"] in (None, BY_PLACE))
             self._compare(Pilot(integrator, scene, sensor))
         dr.sync_thread()
         self.seconds += time.perf_counter() - start

@@ -102,7 +102,6 @@ class Mixed:
 
     def reset(self) -> None:
         self.begin()
-        self.nirc.state.facts = {}
 
     def plan_samples(self, spp: int | None) -> None:
         """As ``CacheIntegrator.plan_samples``: until None, all calls of :meth:`add` are one image's."""

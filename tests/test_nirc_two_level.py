@@ -524,6 +524,26 @@ def test_film_shows_what_it_shows_with_path(sphere, name, mode):
 # ---------------------------------------------------------------- the pilot
 
 
+@pytest.fixture(autouse=True)
+def pilot_at_once(monkeypatch):
+    """The pilot looks before the first image, however small."""
+    monkeypatch.setattr(importlib.import_module("mi_neural.integrators.pilot"), "WORTH", 0)
+
+
+def test_small_images_are_path_traced_and_measured_when_asked(box, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("mi_neural.integrators.pilot"), "WORTH", 3 * 256)
+    integrator = mi.load_dict({**SMALL, "train_frames": 4, "train_steps": 0})
+    for k in range(2):
+        render(box, integrator, 1, k)
+    assert "pilot" not in integrator.statistics() and integrator.statistics()["split"] == "path tracing, 1 path"
+    render(box, integrator, 1, 2)  # enough samples by now
+    assert integrator.statistics()["pilot"]
+    integrator.reset()
+    integrator.train_first(box)
+    assert "pilot" not in integrator.statistics()
+    assert integrator.measure(box)["pilot"]
+
+
 @pytest.fixture
 def short_pilot(monkeypatch):
     monkeypatch.setattr(importlib.import_module("mi_neural.integrators.pilot"), "PILOT_SAMPLES", 2**13)
@@ -536,8 +556,8 @@ def clockwork(monkeypatch, short_pilot):
     pilot = importlib.import_module("mi_neural.integrators.pilot")
     plain, costs = pilot.Pilot.run, [0.3, 0.7, 0.1]
 
-    def run(self, split, passes=pilot.PILOT_PASSES):
-        images, _ = plain(self, split, passes)
+    def run(self, split, passes=pilot.PILOT_PASSES, first_seed=0):
+        images, _ = plain(self, split, passes, first_seed)
         each = split.n_traced * (costs[0] + split.probability * costs[1])
         each += costs[2] * split.n_cache if split.alpha != 0 else 0
         return images, [1e-6 * each * self.samples] * passes
