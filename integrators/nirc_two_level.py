@@ -42,17 +42,20 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
             self._check(given["residual_samples"] in (None, 1),
                         "ris chooses one direction; leave residual_samples at 1")  # fmt: skip
             given["residual_samples"] = 1
+        if self.mode == "progressive" and given["alpha"] is None and given["cache_samples"] is None:
+            given["alpha"] = 0.0  # the cache is in the biased part already
         try:
             self.choice = pilot.Choice(**given)
         except ValueError as e:
             raise ValueError(f"{self.plugin}: {e}") from None
-        self.cache = ControlCache(self.cache.training, self.cache.shape, self.seed)
+        if self.choice.may_ask:
+            self.cache = ControlCache(self.cache.training, self.cache.shape, self.seed)
         self.inner_channels = [*UNBIASED, *(c for c in self.channels if c not in UNBIASED)]
         self.mixed = progressive.Mixed(self, props) if self.mode == "progressive" else None
 
     @property
     def needs_cache(self) -> bool:
-        return super().needs_cache and self.choice.may_ask
+        return super().needs_cache and (self.choice.may_ask or self.mixed is not None)
 
     @property
     def split(self) -> Split:
@@ -95,7 +98,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         super()._ready(scene, sensor, train)
-        if not self.needs_cache or self.state.image_open or not (train or self.compiling):
+        if not self.choice.may_ask or self.state.image_open or not (train or self.compiling):
             return
         with dr.suspend_grad():
             self.choice.know_alpha(self, scene, sensor, self.split.alpha < 0)
@@ -106,7 +109,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
         self._ready(scene, sensor, train=False)
-        if self.needs_cache:
+        if self.needs_cache and self.choice.may_ask:
             with dr.suspend_grad():
                 self.choice.measure(self, scene, sensor)
         return self.statistics()
@@ -180,7 +183,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
 
         # ----------- How far the cache is believed here; where its terms would cancel, it is not asked
         α, features = mi.Float(0), None
-        if self.needs_cache and field is not None:
+        if self.choice.may_ask and field is not None:
             cancels = (n_cache <= n_traced) & (probability >= 1)
             asked = active & vertex.has_smooth(bsdf) & ~cancels
             α = self.coefficient(field, si, alpha, asked)
@@ -331,7 +334,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
             kept = active & (sampler.together_1d(dimension + depth) < q)
             inv_q = dr.rcp(dr.maximum(q, 1e-6))
 
-            if self.every_vertex and self.needs_cache and field is not None:
+            if self.every_vertex and self.choice.may_ask and field is not None:
                 asked = active & vertex.has_smooth(bsdf)
                 α = self.coefficient(field, si, alpha, asked)
                 asked &= α > 0
@@ -398,7 +401,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
        - |string|
        - ``unbiased``, or ``progressive``: half of the samples are those of ``nirc``, which share the cache, and the
          image is theirs plus that part of the unbiased one's difference, scale by scale, that stands out of its noise;
-         biased, and consistent: it tends to the unbiased image. For "the best image in T seconds". (Default: unbiased)
+         biased, and consistent: it tends to the unbiased image. For "the best image in T seconds". The unbiased part is
+         path tracing there, unless the keys below say otherwise. (Default: unbiased)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is asked per camera sample, those that are traced included. 0: path

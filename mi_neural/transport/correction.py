@@ -17,7 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 #: κ: by how much the energy at a scale must exceed that of its noise, which is known but roughly, to count at all.
-CAUTION = 2.0
+#: Staircase and ajar door, 160x90, 8 to 128 samples: 1.5 to 6 differ by less than a fifth.
+CAUTION = 1.5
 #: Radius over which g is smoothed: the noise of B in it would make the mean of D/g too large.
 LEVEL_RADIUS = 2
 #: Part of the image's mean level that g has everywhere, so that dark places are not divided by nothing.
@@ -54,12 +55,9 @@ def correction(difference: np.ndarray, variance: np.ndarray, level: np.ndarray, 
     g = smooth(np.maximum(level, 0), LEVEL_RADIUS) + max(FLOOR * float(level.mean()), 1e-30)
     v = np.where(ok, variance, 0) / g**2
     r = np.where(ok, difference, 0) / g
-    # One weight for all channels. Noisy pixels count less; by the noise of their neighbourhood, since a pixel's own
-    # depends on its value
+    # Plain means: weights by the noise that is seen favour places which rare bright paths have not yet met
     v = v.mean(axis=-1, keepdims=True)
-    spread = box_mean(v, 3)
-    ok = ok.all(axis=-1, keepdims=True)
-    weight = np.where(ok, 1 / (spread + 0.1 * spread.mean() + 1e-30), 0)
+    weight = 1.0 * ok.all(axis=-1, keepdims=True)
 
     def average(radius):
         w = smooth(weight, radius)
