@@ -391,8 +391,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
     On a CPU a query costs a tenth to a third of a path, and most of the variance lies in the paths' far ends, of which
     the cache knows nothing. So this integrator *measures*: what is not given of the four keys that divide a camera
     sample is chosen by a pilot, which renders some rows with each division and takes the one of least variance times
-    time; path tracing is among them, at its own cost. ``statistics()["pilot"]`` shows the numbers. Numbers of the first
-    vertex are stratified over a pixel's samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide
+    time; path tracing is among them, at its own cost, and what small images get. ``statistics()["pilot"]`` shows the
+    numbers; ``measure(scene)`` has them taken at once. Random numbers of the first vertex are stratified over a pixel's samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide
     together where paths end.
 
     .. pluginparameters::
@@ -409,7 +409,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
          tracing. (Default: measured)
      * - residual_samples
        - |int|
-       - Directions that are traced for direct light, and of which :math:`N_r` go on. (Default: measured, 1, 2 or 4)
+       - Directions that are traced for direct light, and of which :math:`N_r` go on. (Default: measured, 1, 2 or 4; 1
+         where the cache is never asked)
      * - residual_probability
        - |float|
        - Probability, in (0, 1], with which a traced direction goes on beyond direct light: :math:`N_r` is this times
@@ -426,8 +427,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
      * - ris
        - |bool|
        - Choose the one traced direction among the ``cache_samples`` that were asked, in proportion to f cos L plus a
-         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Costs more
-         time than it saves noise in the scenes measured (README). (Default: false)
+         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Was worth
+         its time in one of seven scenes measured (README). (Default: false)
     """
     + SHARED_KEYS.strip("\n")
     + r"""

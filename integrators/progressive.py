@@ -13,7 +13,9 @@ BIASED, UNBIASED = ("cache", "residual"), ("cache", "residual", "variance_cache"
 #: Keys that the biased estimator has in common with the whole.
 SHARED = ("max_depth", "rr_depth", "hide_emitters", "seed", "levels", "hashmap_size", "width", "hidden_layers")
 #: Least and largest share of unbiased samples, and biased ones that come first.
-SHARES, FIRST_BIASED = (1 / 16, 1 / 2), 4
+SHARES, FIRST_BIASED = (1 / 16, 7 / 8), 4
+#: Share of unbiased samples over the ratio of the squared bias found to the noise that it was found in.
+PULL = 4.0
 
 #: A correction is found anew once there are so many times its samples, and when so much of the image is there.
 AGAIN, NEARLY = 1.5, 0.9
@@ -141,7 +143,7 @@ class Mixed:
         variance = self.unbiased.variance("indirect", self.n_unbiased) / self.n_unbiased
         self.found, self.found_at = correction(unbiased - biased, variance, biased), n
         bias = float(np.mean(self.found**2))
-        self.share = float(np.clip(bias / max(float(np.mean(variance)), 1e-30), *SHARES))
+        self.share = float(np.clip(PULL * bias / max(float(np.mean(variance)), 1e-30), *SHARES))
 
     def parts(self) -> Parts:
         """The image so far: the unbiased part's channels with the colour of both."""

@@ -10,7 +10,7 @@ from mi_neural.measure import efficiency
 
 
 def test_relative_variance_is_that_of_one_sample():
-    """Noise of standard deviation 0.5 a sample on a grey of 2: variance 0.25 / (4 + 0.04), whatever the image's samples.
+    """Noise of standard deviation 0.5 a sample on a grey of 2: variance 0.25 / (4 + 0.04), for any number of samples.
 
     40 images of 32x32x3 values: a relative error of 0.4 % of the mean variance, of which 5 are allowed.
     """

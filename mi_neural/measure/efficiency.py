@@ -1,4 +1,4 @@
-"""Efficiency of unbiased integrators, 1 / (variance x time): ``python -m mi_neural.measure.efficiency SCENE -i path ...``.
+"""Efficiency of unbiased integrators, 1 / (variance x time): ``python -m mi_neural.measure.efficiency SCENE -i path``.
 
 Independent images of a few samples a pixel are rendered in turn by each integrator, so that a change in the machine's
 load meets all of them. The variance is that of one camera sample, relative to the squared luminance of its pixel as in
@@ -35,7 +35,7 @@ def relative_variance(images: np.ndarray, spp: int) -> tuple[float, float]:
 
 
 def measure(scene, integrators: dict, spp: int, rounds: int, frames: int) -> list[dict]:
-    """A row of facts for each of the `integrators` (label -> integrator), which have been given `frames` of training."""
+    """A row of facts for each of the `integrators` (label -> integrator), trained for `frames` frames before."""
     for integrator in integrators.values():
         budget.warm_up(scene, integrator, [spp])
         budget.reset(integrator)
