@@ -392,8 +392,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
     the cache knows nothing. So this integrator *measures*: what is not given of the four keys that divide a camera
     sample is chosen by a pilot, which renders some rows with each division and takes the one of least variance times
     time; path tracing is among them, at its own cost, and what small images get. ``statistics()["pilot"]`` shows the
-    numbers; ``measure(scene)`` has them taken at once. Random numbers of the first vertex are stratified over a pixel's samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide
-    together where paths end.
+    numbers; ``measure(scene)`` has them taken at once. Random numbers of the first vertex are stratified over a pixel's
+    samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide together where paths end.
 
     .. pluginparameters::
 

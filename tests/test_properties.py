@@ -25,7 +25,8 @@ N = 48
 LARGEST = float(np.finfo(np.float32).max)
 EXAMPLES = settings(derandomize=True, max_examples=25, deadline=None, database=None)
 
-ANY = st.floats(width=32, allow_subnormal=False)
+EXTREME = st.sampled_from([float("nan"), float("inf"), -float("inf"), 0.0, LARGEST, -LARGEST])
+ANY = st.one_of(EXTREME, st.floats(width=32, allow_subnormal=False))
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False)
 
 
