@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from . import encoding, files
+from . import backprop, encoding, files
 from .files import FILE_VERSION, CacheFileError
 
 __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedField", "Weights"]
@@ -87,13 +87,16 @@ def attach_adam(parameters: dict) -> Adam:
     return optimizer
 
 
-def descend(optimizer: Adam, loss, averaged: dict, learning_rate, decay) -> dict:
-    """One step of Adam down the gradient of `loss`, a differentiable scalar array; returns the new averaged parameters.
+def descend(optimizer: Adam, losses, averaged: dict, learning_rate, decay) -> tuple[dict, mi.Float]:
+    """One step of Adam down the gradient of the sum of `losses`, a differentiable array. Returns (the new averaged
+    parameters, the sum).
 
-    ``averaged <- decay averaged + (1 - decay) current``. A loss that is not finite changes nothing. May be frozen.
+    ``averaged <- decay averaged + (1 - decay) current``. A sum that is not finite changes nothing. May be frozen.
     """
-    dr.backward(loss)
-    ok = dr.isfinite(dr.detach(loss))
+    dr.schedule(dr.detach(losses))  # summed beforehand, they would take a kernel of their own that goes forth
+    dr.backward(losses)
+    loss = dr.sum(dr.detach(losses))
+    ok = dr.isfinite(loss)
     # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
     optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in optimizer})
     optimizer.step(eval=False, active=ok)
@@ -101,7 +104,7 @@ def descend(optimizer: Adam, loss, averaged: dict, learning_rate, decay) -> dict
     decay = dr.select(ok, decay, 1)
     averaged = {k: dr.lerp(dr.detach(optimizer[k]), v, decay) for k, v in averaged.items()}
     dr.eval(optimizer, averaged)
-    return averaged
+    return averaged, loss
 
 
 def moments_of(optimizer: Adam) -> dict[str, np.ndarray]:
@@ -126,8 +129,8 @@ def set_moments(optimizer: Adam, arrays: dict[str, np.ndarray]) -> None:
 class Weights:
     """One set of weights: a hash grid, an MLP as tensors, and the same MLP packed for queries.
 
-    Training multiplies matrices (tensor mode), queries use cooperative vectors. Measured on two cores, 28,672 records
-    through 32-32-32-3 forward and back: tensors 16 ms, cooperative vectors 38 ms; queries are 1 ns apart.
+    Queries use cooperative vectors, and so does training on the CPU, see :mod:`.backprop`. In half precision, which
+    loses small gradients, training multiplies the tensors.
     """
 
     DRJIT_STRUCT = {"grid": object, "mlp": object, "packed": object, "order": object}  # noqa: RUF012
@@ -179,6 +182,16 @@ class Weights:
         weights = dr.gather(mi.Float, flat, self.order)
         self.packed["weights"] = type(self.packed["weights"])(weights)
 
+    def differentiable(self, inputs: list) -> list:
+        """The MLP's outputs as floats, differentiable with respect to `inputs` and the tensors. Packs the latter."""
+        if self.half:
+            n = dr.width(inputs)
+            inputs = dr.concat([i + dr.zeros(mi.Float, n) for i in inputs])
+            out = self.mlp(mi.TensorXf(inputs, shape=(dr.width(inputs) // n, n)))
+            return [out[i, :].array for i in range(out.shape[0])]
+        self.pack()
+        return dr.custom(backprop.Perceptron, inputs, dict(self.mlp.items()), lambda: self.packed.layers)
+
     def __call__(self, inputs: list) -> list:
         """The MLP's outputs by cooperative vectors."""
         if self.half:
@@ -213,6 +226,12 @@ class TrainedField:
         self.current.assign({k: dr.detach(v) for k, v in self.optimizer.items()})
         self.current.order = self.averaged.order  # the same, but known to frozen functions
         self.current.pack()
+
+    def trainable(self) -> Weights:
+        """`current`, made of the optimiser's parameters themselves, so that gradients arrive there."""
+        self.current.assign(self.optimizer)
+        self.current.order = self.averaged.order
+        return self.current
 
     def optimizers(self) -> list:
         """The optimisers that hold the weights being trained."""
@@ -410,22 +429,21 @@ class Field(TrainedField):
 
         Call it once per :meth:`step`, before it.
         """
-        self.current.assign(self.optimizer)
-        n = dr.width(x)
-        inputs = [*self.encode(x, averaged=False), *encoding.direction(w, self.shape.direction_degree)]
-        inputs = [i + dr.zeros(mi.Float, n) for i in inputs]  # the constant harmonic is 1-wide
-        out = self.current.mlp(mi.TensorXf(dr.concat(inputs), shape=(self.shape.n_inputs, n)))
-        return mi.Color3f(*(out[i, :].array for i in range(3))) + 1
+        weights = self.trainable()
+        inputs = [*self.features(weights, x), *encoding.direction(w, self.shape.direction_degree)]
+        return mi.Color3f(*weights.differentiable(inputs)) + 1
 
-    def step(self, loss, learning_rate, decay) -> None:
-        """One step of Adam down the gradient of `loss`, a differentiable scalar array; then the averaged copy.
+    def step(self, losses, learning_rate, decay):
+        """One step of Adam down the gradient of the sum of `losses`, a differentiable array; then the averaged copy.
+        Returns the sum.
 
         ``averaged <- decay averaged + (1 - decay) current``: with a `decay` that grows from 0, as the integrators give
-        it, the average is free of bias from its start. A loss that is not finite changes nothing. May be frozen.
+        it, the average is free of bias from its start. A sum that is not finite changes nothing. May be frozen.
         """
-        average = descend(self.optimizer, loss, self.averaged.parameters(), learning_rate, decay)
+        average, loss = descend(self.optimizer, losses, self.averaged.parameters(), learning_rate, decay)
         self.averaged.assign(average)
         self.averaged.pack()
+        return loss
 
     # -------------------------------------------------------------------------------------------------------------
     # State and files

@@ -141,19 +141,17 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
         dr.eval(y, mean_local, averaged, field.mean)
 
     p = field.predict(records.position, records.direction)
-    if blend:
-        with dr.suspend_grad():
-            blend.observe(records, y * field.scale, dr.maximum(dr.detach(p), 0) * field.scale, averaged)
+    said = dr.detach(p)
+    dr.schedule(said)
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
-    total = dr.sum(dr.select(records.valid, error, 0)) / n_valid
-    mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(dr.detach(p))), 0)) / n_valid
-    dr.schedule(mean_prediction)
-    field.step(total, learning_rate, decay)
+    total = field.step(dr.select(records.valid, error, 0) / n_valid, learning_rate, decay)
     if blend:
         with dr.suspend_grad():
+            blend.observe(records, y * field.scale, dr.maximum(said, 0) * field.scale, averaged)
             blend.refresh()
-    return dr.detach(total), mean_target, mean_prediction
+    mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(said)), 0)) / n_valid
+    return total, mean_target, mean_prediction
 
 
 class IncidentCache:
