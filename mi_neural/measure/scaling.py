@@ -205,14 +205,14 @@ def plot(found: dict[str, list[Point]], title: str):
     figure = Figure(figsize=(3.8 * len(costs), 3.4), layout="constrained")
     for k, (name, label, factor) in enumerate(costs):
         axes = figure.add_subplot(1, len(costs), k + 1)
+        shown = [factor * getattr(p, name) for points in found.values() for p in points if getattr(p, name)]
+        axes.set(title=label, xlabel=title, ylim=(min(shown) / 2, max(shown) * 2))  # also where all are equal
         for integrator, points in found.items():
             line = [(p.x, factor * getattr(p, name)) for p in sorted(points, key=lambda p: p.x) if getattr(p, name)]
             if line:
                 p = exponents(points)[name]["upper"]
                 text = integrator + (f", p = {p[0]:.2f}" if p else "")
                 axes.loglog(*zip(*line, strict=True), marker="o", markersize=4, label=text)
-        shown = [factor * getattr(p, name) for points in found.values() for p in points if getattr(p, name)]
-        axes.set(title=label, xlabel=title, ylim=(min(shown) / 2, max(shown) * 2))  # also where all are equal
         axes.grid(True, which="both", alpha=0.25)
         axes.legend(fontsize=8)
     return figure
