@@ -20,43 +20,57 @@ class Perceptron(dr.CustomOp):
     """Outputs of an MLP (list of floats) from its `inputs` (list of floats), with gradients for these and for its
     `parameters`, a dictionary of tensors.
 
-    `layers` is a function without arguments that gives the layers of the same MLP, packed for cooperative vectors;
-    their order is that of `parameters`, weights before bias.
+    `packed` is a function without arguments that gives the layers of the same MLP, packed for cooperative vectors, and
+    the number of inputs that the first of them takes; the second takes the others, and adds to the first.
     """
 
-    def eval(self, inputs, parameters, layers):
+    def eval(self, inputs, parameters, packed):
         self.parameters = list(parameters)
-        self.steps = []  # (layer, its input)
-        x = list(inputs)
-        for layer in layers():
-            self.steps.append((layer, x))
-            x = list(layer(nn.CoopVec(*x)))
-        return x
+        self.inputs = list(inputs)
+        (self.first, self.second, *self.layers), self.n_first = packed()
+        x = self.first(nn.CoopVec(*self.inputs[: self.n_first]))
+        if len(self.inputs) > self.n_first:
+            x = x + self.second(nn.CoopVec(*self.inputs[self.n_first :]))
+        self.seen = []  # inputs of `layers`
+        for layer in self.layers:
+            self.seen.append(list(x))
+            x = layer(x)
+        return list(x)
 
     def backward(self):
-        δ, products = self.grad_out(), []
-        for k in reversed(range(len(self.steps))):
-            layer, x = self.steps[k]
+        δ, factors = list(self.grad_out()), []  # of each product: rows of inputs, rows of δ, their columns
+        for layer, x in zip(reversed(self.layers), reversed(self.seen), strict=True):
             if isinstance(layer, nn.Linear):
-                products.append((_rows([*x, mi.Float(1)]), len(x), _rows(δ), len(δ)))
-                δ = list(nn.matvec(layer.weights, nn.CoopVec(*δ), transpose=True))
+                factors.append((_rows([*x, mi.Float(1)]), _rows(δ), len(x), len(δ)))
+                δ = _back(layer, δ)
             else:
-                δ = [d * dr.select(v > 0, 1, getattr(layer, "negative_slope", 0)) for d, v in zip(δ, x, strict=True)]
-        dr.eval(δ)  # one kernel, with the rows of all products
-        self.set_grad_in("inputs", δ)
-        gradients = {}
-        names = iter(self.parameters)
-        for x, n_in, d, n_out in reversed(products):
-            product = dr.matmul(x, d, At=True)
-            width = product.shape[1]
-            i, j = dr.meshgrid(dr.arange(mi.UInt32, n_in), dr.arange(mi.UInt32, n_out), indexing="xy")
-            gradients[next(names)] = mi.TensorXf(dr.gather(mi.Float, product.array, i * width + j), (n_out, n_in))
-            j = dr.arange(mi.UInt32, n_out)
-            gradients[next(names)] = mi.TensorXf(dr.gather(mi.Float, product.array, n_in * width + j))
+                leak = getattr(layer, "negative_slope", 0)
+                δ = [dr.select(v > 0, d, leak * d) for d, v in zip(δ, x, strict=True)]
+        factors.append((_rows([*self.inputs, mi.Float(1)]), _rows(δ), len(self.inputs), len(δ)))
+        back = _back(self.first, δ)
+        if len(self.inputs) > self.n_first:
+            back += _back(self.second, δ)
+        dr.eval(back)  # in one kernel with the rows of all products
+        self.set_grad_in("inputs", back)
+
+        gradients, names = {}, iter(self.parameters)
+        for x, δ, n_in, n_out in reversed(factors):
+            # Few outputs go first: they are one block of rows, instead of one column of blocks
+            product = dr.matmul(δ, x, At=True) if δ.shape[1] <= PAD else dr.matmul(x, δ, At=True)
+            per_input, per_output = (1, x.shape[1]) if δ.shape[1] <= PAD else (δ.shape[1], 1)
+            i, j = dr.arange(mi.UInt32, n_in * n_out) % n_in, dr.arange(mi.UInt32, n_in * n_out) // n_in
+            weights = dr.gather(mi.Float, product.array, i * per_input + j * per_output)
+            bias = n_in * per_input + dr.arange(mi.UInt32, n_out) * per_output
+            bias = dr.gather(mi.Float, product.array, bias)
+            gradients |= {next(names): mi.TensorXf(weights, (n_out, n_in)), next(names): mi.TensorXf(bias)}
         self.set_grad_in("parameters", gradients)
 
     def name(self):
         return "perceptron"
+
+
+def _back(layer, δ: list) -> list:
+    return list(nn.matvec(layer.weights, nn.CoopVec(*δ), transpose=True))
 
 
 def _rows(columns: list):

@@ -72,6 +72,10 @@ class OutgoingShape(FieldShape):
         directions = (self.direction_degree + 1) ** 2 - 1 + (self.normal_degree + 1) ** 2 - 1  # no constants
         return self.n_levels * self.n_features + directions + 3 + ROUGHNESS_BINS
 
+    @property
+    def n_first(self) -> int:
+        return self.n_inputs  # every query is at another point
+
 
 def reflectance(albedo):
     """The factor that is taken out of the targets and multiplied back at queries."""

@@ -13,6 +13,9 @@ from mi_neural.measure import benchmark, budget, denoise, environment, exr, load
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
+#: Seconds of training after which `render` writes a first image of one sample a pixel, to be replaced by the final one.
+PREVIEW_SECONDS = 1.0
+
 
 @options.readable
 def render(
@@ -40,7 +43,10 @@ def render(
     load_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="start from what was learned")] = None,
     json_: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="write the facts")] = None,
 ) -> None:
-    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute."""
+    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute.
+
+    Where a cache trains for long, a first image of one sample a pixel is written after a second of it.
+    """
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")
     terminal.positive("--spp", spp)
@@ -75,7 +81,7 @@ def render(
     terminal.depth_notes(ref, loaded, [case])
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
-    seconds_pretrain = 0.0
+    seconds_pretrain, first_image = 0.0, None
 
     def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
         row = benchmark.make_row(
@@ -84,11 +90,25 @@ def render(
             environment=environment.describe(), budget_seconds=seconds, pretrain_frames=pretrain,
             seconds_pretrain=seconds_pretrain,
         )  # fmt: skip
-        row.image = str(output)
+        row.image, row.seconds_to_first_image = str(output), first_image or environment.seconds_since_start()
         return row
 
     def keep(so_far: budget.Rendered) -> None:
+        nonlocal first_image
         terminal.write_image(output, describe(so_far, so_far.rgb), so_far.rgb, so_far)
+        first_image = first_image or environment.seconds_since_start()
+
+    def previewed(progress: budget.Progress) -> budget.Progress:
+        """`progress` of training, which also writes a first image once that has gone on for a while."""
+        start = budget.clock()
+
+        def advance(done: float, total: float) -> None:
+            progress(done, total)
+            late = first_image is None and done < total and budget.clock() - start > PREVIEW_SECONDS
+            if late and (so_far := budget.preview(loaded.scene, case.integrator, seed)) is not None:
+                keep(so_far)
+
+        return advance
 
     with terminal.Bars() as bars:
         if denoise_:
@@ -107,7 +127,7 @@ def render(
         seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
         seconds_first = 0.0
         if seconds is None and not stopped:
-            bars_first = bars("training") if hasattr(case.integrator, "train_first") else None
+            bars_first = previewed(bars("training")) if hasattr(case.integrator, "train_first") else None
             seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
         if stopped:  # the image that can be had at once
             rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
@@ -141,6 +161,7 @@ def render(
     if save_cache is not None:
         case.integrator.save_cache(str(save_cache))
     terminal.print_rows([row])
-    terminal.out.print(f"wrote {output}", soft_wrap=True, markup=False)
+    first = f"first image {row.seconds_to_first_image:.1f} s after the start"
+    terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
     if rendered.interrupted:
         raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")

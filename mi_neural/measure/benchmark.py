@@ -37,7 +37,7 @@ class Row:
     """One line of a table: what was rendered, what it cost, what it is worth. Times in seconds, of one frame.
 
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
-    of an integrator without a cache.
+    of an integrator without a cache. `seconds_to_first_image` counts from the start of the process, compiling included.
     """
 
     scene: str
@@ -70,6 +70,7 @@ class Row:
     flicker: float | None = None
     interrupted: bool = False
     image: str | None = None
+    seconds_to_first_image: float | None = None
     statistics: dict[str, object] = field(default_factory=dict)
     environment: dict[str, object] = field(default_factory=dict)
 
