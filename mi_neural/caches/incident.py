@@ -110,16 +110,14 @@ def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
     return total * (1 / n)
 
 
-LOCAL_BY = "current"
-
-
-def local_mean(field: Field, features: list, records: TrainingRecords, n: int, sampler, by):
-    """Mean prediction over the cosine-weighted hemisphere at each record, over `scale`, from `n` queries."""
+def local_mean(field: Field, features: list, records: TrainingRecords, n: int, sampler):
+    """Mean prediction, by the weights being trained, over the cosine-weighted hemisphere at each record, over `scale`,
+    from `n` queries."""
     frame = mi.Frame3f(mi.Normal3f(records.normal))
 
     def add(i, total, sampler):
         w = frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
-        return i + 1, total + loss.luminance(dr.maximum(field.raw(features, w, by), 0)), sampler
+        return i + 1, total + loss.luminance(dr.maximum(field.raw(features, w, averaged=False), 0)), sampler
 
     _, total, _ = dr.while_loop(
         (mi.UInt32(0), mi.Float(0), sampler), lambda i, total, sampler: i < n, add, label="local mean"
@@ -144,9 +142,8 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
     p = field.predict(records.position, records.direction)
     with dr.suspend_grad():
         sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
-        by = LOCAL_BY == "averaged"
-        features = field.encode(records.position, averaged=by)
-        mean_local = local_mean(field, features, records, training.n_local, sampler, by)
+        features = field.encode(records.position, averaged=False)  # the same look-ups as the prediction's
+        mean_local = local_mean(field, features, records, training.n_local, sampler)
     said = dr.detach(p)
     dr.schedule(said)
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
