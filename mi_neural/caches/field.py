@@ -206,6 +206,10 @@ class Weights:
         for k in self.mlp:
             self.mlp[k] = parameters[k]
 
+    def finite(self):
+        """Whether all weights are, 1-wide."""
+        return dr.isfinite(dr.sum(dr.detach(self.grid.data)) + dr.sum(mi.Float(self.packed["weights"])))
+
     def pack(self) -> None:
         """Bring the packed MLP up to date."""
         flat = dr.concat([mi.Float(0), *(dr.detach(v).array for v in self.mlp.values())])

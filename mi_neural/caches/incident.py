@@ -149,6 +149,7 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
     total = field.step(dr.select(records.valid, error, 0) / n_valid, learning_rate, decay)
+    total = dr.select(field.averaged.finite(), total, math.nan)  # queries would hide it
     if blend:
         with dr.suspend_grad():
             blend.observe(records, y * field.scale, dr.maximum(said, 0) * field.scale, averaged)
