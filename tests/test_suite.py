@@ -4,12 +4,14 @@ import json
 import math
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from fake_cache import register
 from scipy import stats
 from typer.testing import CliRunner
 
+from mi_neural import scenes
 from mi_neural.cli import app
 from mi_neural.measure import benchmark, collection, curves, exr, load, metrics, reference, repeats, report, suite
 
@@ -139,6 +141,22 @@ def test_curves_are_means_over_repeats_at_each_budget_and_sample_count():
     assert curves.svg(rows, ("steady",)) is None and "<svg" in curves.svg(rows, ("curve",))
 
 
+def test_another_seed_learns_by_other_numbers():
+    def loss(integrator) -> float:
+        return integrator.train(sphere, 3)["loss"]
+
+    small = {"type": "nirc", "train_samples": 512}
+    sphere = mi.load_file(str(scenes.path("point_lit_sphere")), resx=16, resy=16)
+    integrator = mi.load_dict({**small, "light_sampler": {"type": "nvc_lights"}})
+    first = loss(integrator)
+    integrator.reseed(7)
+    assert integrator.cache.steps == 0 and integrator.light_sampler.cache.seed == 7
+    other = loss(integrator)
+    integrator.reseed(0)
+    assert loss(integrator) == pytest.approx(first, rel=1e-3) != pytest.approx(other, rel=1e-2)
+    assert loss(mi.load_dict({**small, "seed": 7})) == pytest.approx(other, rel=1e-3), "as if it had been given by key"
+
+
 # ---------------------------------------------------------------- the command
 
 QUICK = ("-i", "path:max_depth=2", "-i", "fake_cache:fraction=0.2,max_depth=2", "--seconds", "0.03", "--reference-spp",
@@ -168,8 +186,6 @@ def test_scenes_and_repeats_end_in_one_report():
 
 
 def test_repeats_are_independent_and_train_by_their_own_seeds(monkeypatch):
-    import mitsuba as mi
-
     seeds = []
     loaded = load.load_scene("scenes/moon.xml", (6, 6))
     (case,) = benchmark.make_cases(loaded, [load.parse_integrator("fake_cache")])
