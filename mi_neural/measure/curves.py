@@ -19,7 +19,7 @@ def line(rows: Iterable[Row], over: str, name: str) -> list[tuple[float, float, 
     places: dict[float, list[Row]] = {}
     for row in rows:
         if getattr(row, name):
-            place = row.spp if row.mode in ("curve", "spp") else row.budget_seconds or 0.0
+            place = row.spp if row.mode == "curve" else row.budget_seconds or 0.0
             places.setdefault(place, []).append(row)
     points = []
     for at in places.values():

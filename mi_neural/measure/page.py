@@ -23,20 +23,13 @@ MODE_TEXT = {
     "one-shot": "One image from nothing: wall time from compiled kernels, training included",
     "sample": "One-sample frames of a running sequence, trained before",
     "steady": "Frames of a running sequence at equal time, trained before; the denoiser's time is part of the frame",
-    "spp": "A fixed number of samples",
 }
 #: Modes whose errors are drawn together, by the name of the drawing.
-CURVES = {
-    "one-shot": ("one-shot",),
-    "unfinished": ("curve",),
-    "steady": ("sample", "steady"),
-    "spp": ("spp",),
-}
+CURVES = {"one-shot": ("one-shot",), "unfinished": ("curve",), "steady": ("sample", "steady")}
 CURVE_TEXT = {
     "one-shot": "Error of finished images over their budget",
     "unfinished": "Error of the longest image while it was rendered, after 1, 2, 4, ... samples",
     "steady": "Error of frames over their time",
-    "spp": "Error over samples",
 }
 #: Bytes of pixels up to which a page's pictures are kept exactly; beyond, they are JPEG.
 EXACT_BYTES = 30e6
