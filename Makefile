@@ -35,7 +35,7 @@ BENCH := -i path -i nirc -i nrc -i nirc:termination=auto -i nirc_two_level --sec
     --repeats 3 --denoise
 
 bench: $(STAMP)  ## integrators on our own scenes: tables and report in out/bench; under 20 minutes on two cores, goes on where stopped
-	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 192x108,144x144 --reference-spp 512 -o out/bench
+	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 192x108,144x144 --reference-spp 1024 -o out/bench
 
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(STAMP)  ## the default tests, a few minutes on two cores

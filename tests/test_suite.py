@@ -131,6 +131,9 @@ def test_factor_is_a_geometric_mean_over_scenes():
     assert title == "one-shot 1 s" and cells[0] == ["integrator", "a", "b", "factor"]
     assert [line[-1] for line in cells[1:]] == ["1", "4"]
     assert cells[1][1] == "1 / 0.1"
+    scenes[0].groups.pop()  # as if interrupted
+    ((_, cells),) = report.summary(report.Report("", {}, scenes))
+    assert cells[2] == ["nirc", "", "1 / ", ""]
 
 
 def test_curves_are_means_over_repeats_at_each_budget_and_sample_count():

@@ -93,7 +93,8 @@ def split_table(groups: Iterable[Group]) -> list[list[str]]:
 
 def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
     """One table for each mode and budget: integrators over scenes, trimmed relMSE / FLIP, and by which factor trimmed
-    relMSE is below that of the first integrator with as much denoising, as a geometric mean over the scenes."""
+    relMSE is below that of the first integrator with as much denoising: a geometric mean over the scenes where
+    neither is below what the reference resolves, left out where a scene is missing."""
     tables = []
     groups = [g for scene in report.scenes for g in scene.groups if g.mean("relmse_trimmed") is not None]
     for mode, budget in dict.fromkeys((g.first.mode, g.first.budget_seconds) for g in groups):
@@ -112,8 +113,9 @@ def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
                 if g is not None and first is not None:
                     errors[scene.name] = first.mean("relmse_trimmed"), g.mean("relmse_trimmed")
             ratios = [np.log(a / b) for a, b in errors.values() if a and b]
+            complete = ratios and len(errors) == len(report.scenes)
             cells.append([label + (" + denoiser" if denoised else ""), *texts,
-                          number(float(np.exp(np.mean(ratios)))) if ratios else ""])  # fmt: skip
+                          number(float(np.exp(np.mean(ratios)))) if complete else ""])  # fmt: skip
         tables.append((f"{mode}{f' {budget:g} s' if budget else ''}", cells))
     return tables
 

@@ -99,7 +99,7 @@ class Suite:
         terminal.announce(f"warning: {self.notes[-1]}")
 
     def _scene(self, file: Path, name: str, folder: Path) -> None:
-        settings, plan = self.settings, self.settings.plan
+        settings = self.settings
         folder.mkdir(parents=True, exist_ok=True)
         given = settings.parameters
         if len(self.files) > 1:
@@ -112,18 +112,30 @@ class Suite:
         terminal.announce(f"{name} {loaded.size[0]}x{loaded.size[1]}, {labels}")
         reference = self._reference(loaded)
         notes = terminal.depth_notes(reference, loaded, cases) + terminal.notes(reference, settings.denoise)
+        found = report.SceneResult(name, loaded.size, [], [], reference.facts(), notes)
+        self.results.append(found)
+        try:
+            self._measure(loaded, cases, reference, found, folder)
+        finally:
+            found.groups = repeats.group(found.rows)
+            for of_kind in found.groups if settings.plan.repeats > 1 else []:
+                repeats.tell_apart(of_kind, lambda row: row.image and exr.read(folder / row.image).rgb, reference)
+
+    def _measure(
+        self, loaded: load.LoadedScene, cases: list[benchmark.Case], reference: references.Reference,
+        found: report.SceneResult, folder: Path,
+    ) -> None:  # fmt: skip
+        """Fill in the rows and pictures of a scene; images and what is needed to go on are written to `folder`."""
+        settings, plan = self.settings, self.settings.plan
         done = kept.Kept(folder, kept.settings_of(loaded, cases, plan, reference, settings.denoise))
         self._kept.append(done)
         if done.rows:
             terminal.announce(f"{len(done.rows)} rows are there already, of the same command interrupted")
-
         exposure = exr.automatic_exposure(reference.rgb)
         exr.write_png(folder / "reference.png", reference.rgb, exposure)
         n_pixels = loaded.size[0] * loaded.size[1]
         exact = 2 * 3 * n_pixels * settings.kinds() * len(self.files) < page.EXACT_BYTES
-        found = report.SceneResult(name, loaded.size, [], [], reference.facts(), notes)
         found.entries.append(page.reference_entry(reference, exposure, exact))
-        self.results.append(found)
 
         def keep(picture: benchmark.Picture) -> None:
             row = picture.row
@@ -136,23 +148,19 @@ class Suite:
                 exr.write_png(folder / (terminal.slug(row) + ".png"), picture.rgb, exposure)
                 found.entries.append(page.entry(picture, exposure, exact))
 
-        try:
-            self.bars("guides for the denoiser" if settings.denoise else "starting")
-            guides = denoise.render_guides(loaded.scene, plan.seed) if settings.denoise else None
-            if guides:
-                notes.append(f"The guides took {guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp), counted for nobody.")
-            bench = benchmark.Bench(loaded, reference, guides, environment.describe(), keep, self.bars, done)
-            for case in cases:
-                try:
-                    bench.run([case], plan)
-                except (ValueError, RuntimeError) as error:
-                    if len(self.files) == 1:
-                        raise
-                    self._leave_out(f"{case.spec.label} on {name}", error)
-        finally:
-            found.groups = repeats.group(found.rows)
-            for of_kind in found.groups if plan.repeats > 1 else []:
-                repeats.tell_apart(of_kind, lambda row: row.image and exr.read(folder / row.image).rgb, reference)
+        self.bars("guides for the denoiser" if settings.denoise else "starting")
+        guides = denoise.render_guides(loaded.scene, plan.seed) if settings.denoise else None
+        if guides:
+            seconds = f"{guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp)"
+            found.notes.append(f"The guides took {seconds}, counted for nobody.")
+        bench = benchmark.Bench(loaded, reference, guides, environment.describe(), keep, self.bars, done)
+        for case in cases:
+            try:
+                bench.run([case], plan)
+            except (ValueError, RuntimeError) as error:
+                if len(self.files) == 1:
+                    raise
+                self._leave_out(f"{case.spec.label} on {found.name}", error)
 
     def _reference(self, loaded: load.LoadedScene) -> references.Reference:
         """The image that was named, or the one beside the scene, or one that is rendered or was before."""
