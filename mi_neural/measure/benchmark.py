@@ -195,8 +195,9 @@ class Bench:
             watch=stages.append if seconds == max(plan.seconds) else None,
         )  # fmt: skip
         facts = {"seed": seed, "repeat": repeat, "budget_seconds": seconds}
-        for stage in stages if self.reference is not None else []:
-            self._rows(case, "curve", [stage], **facts)
+        if self.reference is not None and not rendered.interrupted:
+            for stage in stages:
+                self._rows(case, "curve", [stage], **facts)
         self._rows(case, "one-shot", [rendered], **facts)
 
     def steady(self, case: Case, plan: Plan, repeat: int) -> None:
@@ -220,12 +221,12 @@ class Bench:
             pass_times[size] = frame.seconds_render
 
         self._progress(f"{name}: 1-sample frames")
-        frames = []
+        samples = []
         for k in range(SAMPLE_FRAMES):
-            frames.append(budget.render_samples(scene, integrator, 1, seed + k))
-            if frames[-1].interrupted:
+            samples.append(budget.render_samples(scene, integrator, 1, seed + k))
+            if samples[-1].interrupted:
                 break
-        self._rows(case, "sample", frames, **facts)
+        self._rows(case, "sample", samples, **facts)
 
         for seconds in plan.frame_seconds:
             for with_denoiser in (False, True) if self.guides else (False,):
@@ -243,7 +244,7 @@ class Bench:
                         break
                 self._rows(case, "steady", frames, budget_seconds=seconds, only_denoised=with_denoiser, **facts)
         parts = split.measure(scene, integrator).to_json()  # last, as it trains on
-        self._rows(case, "split", frames[-1:], only_denoised=False, split=parts, **facts)
+        self._rows(case, "split", samples, only_denoised=False, split=parts, **facts)
 
     def _begin(self, case: Case, plan: Plan, repeat: int) -> int:
         """Forget what was learned; returns the seed of this repeat, which training follows as well."""
