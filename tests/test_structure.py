@@ -28,6 +28,7 @@ LAYERS = [
     {"emitters"},  # light samplers do not know integrators
     {"integrators"},
     {"measure"},
+    {"explore"},
     {"commands"},
     {"cli"},
 ]
