@@ -168,6 +168,7 @@ def curve_png(curve: list[tuple[float, str, float]]) -> bytes:
     """Error over time where there is one, else the loss, as a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     names = [name for _, name, _ in curve]
     name = "trimmed relMSE" if "trimmed relMSE" in names else "loss"
@@ -177,6 +178,9 @@ def curve_png(curve: list[tuple[float, str, float]]) -> bytes:
     if points:
         axes.plot(*zip(*points, strict=True), linewidth=1)
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set(xlabel="seconds of rendering", ylabel=name)
     axes.grid(True, which="both", alpha=0.25)
     buffer = io.BytesIO()

@@ -7,6 +7,7 @@ stands still. Frames are asked for by the page, which must be there and have sho
 
 from __future__ import annotations
 
+import asyncio
 import html
 import time
 import weakref
@@ -23,6 +24,8 @@ from mi_neural.measure import exr
 SHOWN = ("picture", "reliability", "visibility", "visibility, traced")
 #: Seconds between updates of the hemisphere and of the curve, which take longer than others.
 HEMISPHERE_SECONDS, CURVE_SECONDS = 0.5, 2.0
+#: Seconds between frames in which the notebook's messages are read; reading one takes several turns of its loop.
+BREATH = 0.01
 #: Degrees a CSS pixel of a drag turns, distance factor of a wheel's unit, and the drag that still is a click.
 DRAG_DEGREES, WHEEL_FACTOR, CLICK_PIXELS = 0.4, 1.001, 4
 
@@ -171,8 +174,15 @@ class LiveView(w.VBox):
             self.stop()
             self.status.value = f"<b>{html.escape(type(error).__name__)}</b>: {html.escape(str(error))}"
             raise
-        self.canvas.request_draw()
+        self._next()
         return frame
+
+    def _next(self) -> None:
+        """Ask for the next frame, after a breath."""
+        try:
+            asyncio.get_running_loop().call_later(BREATH, self.canvas.request_draw)
+        except RuntimeError:  # no notebook
+            self.canvas.request_draw()
 
     def _shown_now(self) -> np.ndarray:
         what, session = self._shown.value, self.session
