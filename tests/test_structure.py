@@ -29,6 +29,7 @@ LAYERS = [
     {"integrators"},
     {"measure"},
     {"explore"},
+    {"manual"},
     {"commands"},
     {"cli"},
 ]

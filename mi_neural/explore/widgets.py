@@ -17,7 +17,7 @@ import ipywidgets as w
 import numpy as np
 from jupyter_rfb import RemoteFrameBuffer
 
-from mi_neural.explore import panels, views
+from mi_neural.explore import panels, pictures, views
 from mi_neural.measure import exr
 
 #: What the picture's place can show.
@@ -189,9 +189,9 @@ class LiveView(w.VBox):
         try:
             if what == "reliability":
                 view = views.ReliabilityMap(session.scene, session.integrator, session.sensor)
-                return panels.colours(view.predicted())
+                return pictures.colours(view.predicted())
             if what.startswith("visibility"):
-                return panels.colours(self._visibility(what), "gray")
+                return pictures.colours(self._visibility(what), "gray")
         except views.Unavailable as why:
             self._shown.value = "picture"
             self.disks_caption.value = _small(str(why))
@@ -222,7 +222,7 @@ class LiveView(w.VBox):
             predicted, left = h.predicted(), "as the cache says"
         except views.Unavailable as why:
             predicted, left = np.zeros_like(h.traced), str(why)
-        self.disks.value = panels.side_by_side([predicted, h.traced], self.exposure)
+        self.disks.value = pictures.side_by_side([predicted, h.traced], self.exposure)
         place = ", ".join(f"{v:.3g}" for v in h.position)
         text = f"Indirect light that arrives at ({place}): {left}; path-traced, {h.spp} paths a direction"
         self.disks_caption.value = _small(text)
@@ -231,7 +231,7 @@ class LiveView(w.VBox):
         if not self._due("curve", CURVE_SECONDS):
             return
         self.session.measure()
-        self.curve.value = panels.curve_png(self.session.curve)
+        self.curve.value = pictures.curve_png(self.session.curve)
 
     def _tell(self) -> None:
         s = self.session
