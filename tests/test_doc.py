@@ -6,6 +6,7 @@ import shlex
 
 import mitsuba as mi
 import pytest
+import typer
 from rich.console import Console
 from test_structure import plugin_class, table_rows
 from typer.testing import CliRunner
@@ -162,7 +163,8 @@ def test_modules_that_guides_and_readme_run_exist(root):
 
 
 def test_site_has_all_pages_and_no_dead_links(tmp_path):
-    site.write(tmp_path, python=False)
+    program = typer.main.get_command(cli.app)
+    site.write(tmp_path, program.context_class(program, info_name="mi-neural"), python=False)
     names = {f.stem for f in tmp_path.glob("*.html")}
     assert names == {*PLUGINS, *GUIDES, "index", "commands"}
     for file in tmp_path.glob("*.html"):
@@ -171,5 +173,6 @@ def test_site_has_all_pages_and_no_dead_links(tmp_path):
         for target in re.findall(r'(?:href|src)="([^"#:]+)"', text):
             assert (tmp_path / target).exists(), f"{file.name} leads to {target}"
     assert "<math" in (tmp_path / "nirc.html").read_text(encoding="utf-8")
+    commands = (tmp_path / "commands.html").read_text(encoding="utf-8")
     for command in cli.app.registered_commands:
-        assert f"mi-neural {command.name or command.callback.__name__}" in (tmp_path / "commands.html").read_text()
+        assert f"Usage: mi-neural {command.name or command.callback.__name__}" in commands

@@ -1,4 +1,4 @@
-"""The manual as static HTML: ``python -m mi_neural.manual.site -o DIR``, or ``make docs``.
+"""The manual as static HTML: ``mi-neural doc --html DIR``, or ``make docs``.
 
 Plugins' pages by docutils, guides by markdown-it, the Python interface by pdoc, commands by what their ``--help`` says.
 """
@@ -10,13 +10,9 @@ import re
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from mi_neural.manual import pages
 from mi_neural.measure import exr
-from mi_neural.measure.terminal import DEFAULT_VARIANT, set_variant
 
 #: What the Python pages are of: the interface that the guides speak of.
 MODULES = ("mi_neural", "mi_neural.explore.live", "mi_neural.explore.session", "mi_neural.explore.views",
@@ -68,21 +64,18 @@ def guide_html(markdown: str) -> str:
     return MarkdownIt("commonmark").enable("table").render(markdown)
 
 
-def commands() -> dict[str, str]:
-    """What ``mi-neural COMMAND --help`` prints, by command; '' for the program itself."""
-    from typer.testing import CliRunner
-
-    from mi_neural import cli
-
-    def help_of(*words: str) -> str:
-        return CliRunner().invoke(cli.app, [*words, "--help"], prog_name="mi-neural", terminal_width=100).output
-
-    names = [command.name or command.callback.__name__ for command in cli.app.registered_commands]
-    return {"": help_of()} | {name: help_of(name) for name in names}
+def commands(context) -> dict[str, str]:
+    """What ``--help`` says, by command; '' for the program itself, whose context is given."""
+    program, texts = context.command, {"": context.command.get_help(context)}
+    for name in program.list_commands(context):
+        command = program.get_command(context, name)
+        inner = type(context)(command, info_name=name, parent=context, max_content_width=100, terminal_width=100)
+        texts[name] = command.get_help(inner)
+    return texts
 
 
-def write(folder: Path, python: bool = True) -> None:
-    """Write all pages to `folder`; the Python pages need pdoc."""
+def write(folder: Path, context, python: bool = True) -> None:
+    """Write all pages to `folder`; `context` is the program's, as click has it. The Python pages need pdoc."""
     found = {name: pages.plugin_page(name) for name in pages.plugins()}
     titles = pages.guides()
     folder.mkdir(parents=True, exist_ok=True)
@@ -101,7 +94,7 @@ def write(folder: Path, python: bool = True) -> None:
         put(name, title, guide_html(pages.guide(name)))
     for picture in Path(__file__).parent.glob("*.png"):
         shutil.copy(picture, folder / picture.name)
-    parts = [f"<h2>mi-neural {name}</h2>\n<pre>{html.escape(text)}</pre>" for name, text in commands().items()]
+    parts = [f"<h2>mi-neural {name}</h2>\n<pre>{html.escape(text)}</pre>" for name, text in commands(context).items()]
     put("commands", "commands", "<h1>Commands</h1>\n" + "\n".join(parts))
     put("index", "contents", _contents(found, titles))
     if python:
@@ -132,16 +125,3 @@ def _python(folder: Path) -> None:
         pdoc.render.configure(docformat="restructuredtext", show_source=False, template_directory=Path(templates))
         pdoc.pdoc(*MODULES, output_directory=folder)
 
-
-def main(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="folder for the pages")],
-    python: Annotated[bool, typer.Option(help="the Python pages as well")] = True,
-) -> None:
-    """Write the manual as HTML."""
-    set_variant(DEFAULT_VARIANT)
-    write(output, python)
-    print(f"wrote {output / 'index.html'}")
-
-
-if __name__ == "__main__":
-    typer.run(main)
