@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/mi_neural.stamp
+TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
 .PHONY: help demo picture gallery gallery-pictures docs test stress lint clean
@@ -19,6 +20,11 @@ $(STAMP): pyproject.toml
 	it needs 3.10 or newer. Type: make PYTHON=python3.11" % v[:2])'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 	    echo "mi_neural: could not make $(VENV). On Debian and Ubuntu type: apt install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet -e '.[denoise]'
+	@touch $@
+
+# What tests need beside, which a picture does not wait for.
+$(TESTS): $(STAMP)
 	$(BIN)/python -m pip install --quiet -e '.[denoise,test]'
 	@touch $@
 
@@ -56,13 +62,13 @@ docs: pyproject.toml | $(STAMP)  ## the manual as HTML: out/docs/index.html
 	$(BIN)/mi-neural doc --html out/docs
 
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
-test: $(STAMP)  ## the default tests, a few minutes on two cores
+test: $(TESTS)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-stress: $(STAMP)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
+stress: $(TESTS)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
 	$(BIN)/python tests/stress.py -o out/stress
 
-lint: $(STAMP)  ## ruff
+lint: $(TESTS)  ## ruff
 	$(BIN)/ruff check .
 
 clean:  ## remove what builds, tests and the demo wrote (keeps .venv)

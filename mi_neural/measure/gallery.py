@@ -78,7 +78,7 @@ def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.nda
     pictures = [exr.to_srgb8(reference, exposure)]
     seen = set()
     for row in found["rows"]:
-        if not row["image"] or row["denoised"] or row["label"] in seen:
+        if not row["image"] or row["denoised"] or row["mode"] == "sample" or row["label"] in seen:
             continue
         seen.add(row["label"])
         rgb = exr.read(folder / row["image"]).rgb
