@@ -8,6 +8,9 @@ import numpy as np
 
 from mi_neural.measure import exr
 
+#: Of a curve; of more, some are left out.
+MOST_POINTS = 1000
+
 
 def colours(values: np.ndarray, name: str = "viridis") -> np.ndarray:
     """Values in [0, 1] in a colour map of matplotlib, uint8 of shape (height, width, 3)."""
@@ -37,6 +40,7 @@ def curve_png(curve: list[tuple[float, str, float]]) -> bytes:
     names = [name for _, name, _ in curve]
     name = "trimmed relMSE" if "trimmed relMSE" in names else "loss"
     points = [(t, v) for t, kind, v in curve if kind == name and v > 0]
+    points = points[:: 1 + len(points) // MOST_POINTS]
     figure = Figure(figsize=(4.0, 2.2), dpi=100, layout="constrained")
     axes = figure.add_subplot()
     if points:

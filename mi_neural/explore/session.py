@@ -52,8 +52,8 @@ class Session:
 
     @property
     def learns(self) -> bool:
-        """Whether the integrator has something to train."""
-        return hasattr(self.integrator, "train") and not getattr(self.integrator, "freeze_cache", False)
+        """Whether something is being trained."""
+        return math.isfinite(self.loss) and not getattr(self.integrator, "freeze_cache", False)
 
     # -------------------------------------------------------------------------------------------------------------
     # Frames
@@ -66,9 +66,9 @@ class Session:
             if not cumulative:
                 it.plan_samples(None)  # so that each frame trains
             it.plan_samples(self.taken + self.spp)
-        if self.learns and (self.n_frames == 0 or cumulative):
-            # One step, not the many that a first image begins with
-            it.train(self.scene, 1, sensor=self.sensor)
+        if hasattr(it, "train") and (self.n_frames == 0 or cumulative):
+            # Not the many steps that a first image begins with
+            it.train(self.scene, 1 if self.n_frames == 0 else getattr(it, "train_steps", 1), sensor=self.sensor)
         seed = pass_seed(self.seed, STREAM_IMAGE, self.n_frames)
         image = render_pass(self.scene, it, self.spp, seed, self.sensor)
         self.taken += self.spp
