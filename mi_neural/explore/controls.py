@@ -67,8 +67,8 @@ class Light:
     can_turn    it has a direction
     """
 
-    def __init__(self, params, name: str, infinite: bool, brightness: str, known: dict) -> None:
-        self.params, self.name = params, name
+    def __init__(self, params, name: str, infinite: bool, brightness: str, known: dict, up: np.ndarray) -> None:
+        self.params, self.name, self.up = params, name, up
         self.glow = known[f"{name}.{brightness}"]()
         value = self.glow.value
         peak = float(value.max(initial=0.0)) if value.shape == (3,) else 1.0
@@ -81,7 +81,7 @@ class Light:
         self.can_move = self.place is not None and not infinite
         self.can_turn = self.place is not None and self.place.value.shape == (4, 4)
         self._middle = self._centre() if self.place is not None else np.zeros(3)
-        self.set()
+        self._assign()
 
     def _centre(self) -> np.ndarray:
         """What the light is turned about."""
@@ -92,10 +92,15 @@ class Light:
     def set(self, stops: float = 0.0, colour=None, offset=(0.0, 0.0, 0.0), azimuth: float = 0.0,
             elevation: float = 0.0) -> None:  # fmt: skip
         """2^`stops` times as bright as at first, of `colour` (linear RGB, its largest value counting as 1), moved by
-        `offset` in world units, turned by degrees about the vertical (y) axis and the light's own x axis.
+        `offset` in world units, turned by degrees about the vertical axis (the camera's) and the light's own x axis.
 
         What the light cannot do is left out.
         """
+        self._assign(stops, colour, offset, azimuth, elevation)
+        self.params.update()
+
+    def _assign(self, stops=0.0, colour=None, offset=(0.0, 0.0, 0.0), azimuth=0.0, elevation=0.0) -> None:
+        """:meth:`set` without the update of the scene."""
         if self.colour is not None:
             colour = self.colour if colour is None else np.asarray(colour, float) / max(np.max(colour), 1e-6)
             self.glow.set(2.0**stops * self._level * colour)
@@ -104,13 +109,12 @@ class Light:
         if self.can_turn:
             matrix = self.place.value
             own_x = matrix[:3, 0] / np.linalg.norm(matrix[:3, 0])
-            turn = changes.rotate([0, 1, 0], azimuth, self._middle) @ changes.rotate(own_x, elevation, self._middle)
+            turn = changes.rotate(self.up, azimuth, self._middle) @ changes.rotate(own_x, elevation, self._middle)
             self.place.set((changes.translate(offset) if self.can_move else np.eye(4)) @ turn @ matrix)
         elif self.can_move:
             self.place.set(self.place.value + np.asarray(offset, float))
         self.now = {"stops": stops, "colour": colour, "offset": tuple(offset), "azimuth": azimuth,
                     "elevation": elevation}  # fmt: skip
-        self.params.update()
 
     @property
     def moved(self) -> bool:
@@ -121,8 +125,11 @@ class Light:
         return recoloured or any(np.any(v) for v in now.values())
 
 
-def lights(scene) -> list[Light]:
-    """The scene's emitters that have something to set, in the order of ``mi.traverse(scene)``."""
+def lights(scene, up=(0.0, 1.0, 0.0)) -> list[Light]:
+    """The scene's emitters that have something to set, in the order of ``mi.traverse(scene)``; `up` is vertical.
+
+    From here on what they set are variables, which kernels read, and no constants that are compiled.
+    """
     params = mi.traverse(scene)
     known, found = changes.keys(params), {}
     emitters = {emitter.class_name() for emitter in scene.emitters()}
@@ -131,7 +138,9 @@ def lights(scene) -> list[Light]:
         if name and owner not in found:
             node = params.properties.get(f"{owner}.sampling_weight", (None, None, None, 0))[2]
             if node is not None and node.class_name() in emitters:
-                found[owner] = Light(params, owner, node.class_name() in INFINITE, name, known)
+                found[owner] = Light(params, owner, node.class_name() in INFINITE, name, known, np.asarray(up, float))
+    if found:
+        params.update()
     return list(found.values())
 
 

@@ -36,9 +36,8 @@ class Session:
             raise ValueError(f"spp is {spp}; it must be at least 1")
         self.scene, self.sensor, self.spp, self.seed = scene, sensor, spp, seed
         self.integrator = _integrator(scene, integrator)
-        # From here on what they set are variables, which kernels read
         self.camera = controls.Camera(scene, sensor)
-        self.lights = controls.lights(scene)
+        self.lights = controls.lights(scene, self.camera.up)
         self.reference = None if reference is None else _reference(reference, self.size)
         self.n_frames = 0
         self.curve: list[tuple[float, str, float]] = []  # (seconds of rendering, quantity, value)

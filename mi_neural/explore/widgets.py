@@ -192,7 +192,7 @@ class LiveView(w.VBox):
                 return pictures.colours(view.predicted())
             if what.startswith("visibility"):
                 return pictures.colours(self._visibility(what), "gray")
-        except views.Unavailable as why:
+        except ValueError as why:  # nothing of the kind here, or no such light
             self._shown.value = "picture"
             self.disks_caption.value = _small(str(why))
         return session.picture(self.exposure)
