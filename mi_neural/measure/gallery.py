@@ -19,7 +19,8 @@ import typer
 from . import exr, metrics
 from .load import InputError
 from .montage import montage
-from .report import flip_colours, number
+from .page import flip_colours
+from .report import number
 from .sequence import frame_path
 
 #: Frames a second of animations, and what WebP may lose (100: nothing).
