@@ -117,17 +117,13 @@ def _caption(row: dict) -> str:
 
 def command_of(row: dict, found: dict) -> str:
     """The command that renders such a picture as a row's."""
-    words = ["mi-neural", "render", _scene(found["command"]), "-i", row["label"].replace(" ", "")]
+    scene = shlex.split(found["command"])[2]  # mi-neural compare SCENE ..., or --scenes FOLDER
+    words = ["mi-neural", "render", found["scene"] if scene.startswith("-") else scene, "-i", row["label"]]
     width, height = row["size"]
     words += [*_defines(found["command"]), "--size", f"{width}x{height}"]
     words += ["--pretrain", str(row["pretrain_frames"])] if row["pretrain_frames"] else []
     words += ["--seconds", f"{row['budget_seconds']:g}"] if row["budget_seconds"] else ["--spp", f"{row['spp']:g}"]
     return shlex.join([*words, "-o", "picture.png"])
-
-
-def _scene(command: str) -> str:
-    """The scene of a command `mi-neural compare SCENE ...`."""
-    return shlex.split(command)[2]
 
 
 def _defines(command: str) -> list[str]:
