@@ -10,6 +10,7 @@ from __future__ import annotations
 import typer
 
 from mi_neural.commands.compare import compare
+from mi_neural.commands.doc import doc
 from mi_neural.commands.info import info
 from mi_neural.commands.render import render
 from mi_neural.commands.sequence import sequence
@@ -26,6 +27,7 @@ app.command()(render)
 app.command()(compare)
 app.command()(sequence)
 app.command()(info)
+app.command()(doc)
 
 
 def main() -> None:

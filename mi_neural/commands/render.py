@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, terminal
+from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, repeats, terminal
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
@@ -160,7 +160,7 @@ def render(
         exr.write_text(json_, json.dumps(row.to_json(), indent=1) + "\n")
     if save_cache is not None:
         case.integrator.save_cache(str(save_cache))
-    terminal.print_rows([row])
+    terminal.print_rows(repeats.group([row]))
     first = f"first image {row.seconds_to_first_image:.1f} s after the start"
     terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
     if rendered.interrupted:
