@@ -1,10 +1,11 @@
-"""`measure.profile`: parts add up, rates are those of what was computed, the first image is there before the last."""
+"""`measure.profile`: parts add up, rates are those of what was computed, the first image is there before the last; and
+previews while a cache trains."""
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
-from mi_neural.measure import load, profile
-from mi_neural.measure.budget import clock
+from mi_neural.measure import budget, load, profile
 
 SMALL = {"type": "nirc", "levels": 2, "hashmap_size": 256, "width": 8, "train_samples": 128, "train_vertices": 4}
 
@@ -45,10 +46,30 @@ def test_table_shows_every_part(found):
 
 
 def test_flops_are_counted_from_the_time_of_a_product():
-    start = clock()
+    start = budget.clock()
     rate = profile.blas_flops(128, 64, 32)
-    spent = clock() - start
+    spent = budget.clock() - start
     assert rate > 2 * 128 * 64 * 32 / spent  # one of its eight products took less than all of them
+
+
+def test_preview_in_the_middle_of_training_changes_nothing():
+    scene = load.load_scene("cornell_box", (16, 16), {}).scene
+    images, previews = [], []
+    for asks in (False, True):
+        integrator = mi.load_dict({**SMALL, "max_depth": 6, "train_frames": 6})
+
+        def look(done, total, integrator=integrator):
+            previews.append(budget.preview(scene, integrator))
+
+        integrator.train_first(scene, progress=look if asks else None)
+        images.append(budget.render_samples(scene, integrator, 2).rgb)
+        assert integrator.statistics()["steps"] == 6 + 1 and integrator.statistics()["images"] == 1
+    assert len(previews) == 6 and all(p.spp == 1 and p.interrupted and p.rgb.mean() > 0 for p in previews)
+    np.testing.assert_allclose(images[1], images[0], rtol=1e-3, atol=1e-4)
+
+
+def test_integrators_that_learn_nothing_have_no_preview():
+    assert budget.preview(None, mi.load_dict({"type": "path"})) is None
 
 
 @pytest.mark.slow

@@ -1,8 +1,9 @@
 """Training a small MLP on a CPU: forward and back in cooperative vectors, weight gradients as matrix products.
 
 Dr.Jit offers two ways to differentiate an MLP. Its tensor mode is a chain of matrix products that goes through memory
-after each layer, and on a CPU its products are compiled for the oldest processors. Its cooperative vectors run all
-layers in the registers of one kernel, but add up weight gradients entry by entry. This does each where it is good.
+after each layer, and for matrices as narrow as these a CPU spends as long on packing them as on multiplying. Its
+cooperative vectors run all layers in the registers of one kernel, but add up weight gradients entry by entry. This does
+each where it is good.
 """
 
 from __future__ import annotations

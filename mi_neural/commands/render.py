@@ -81,7 +81,7 @@ def render(
     terminal.depth_notes(ref, loaded, [case])
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
-    seconds_pretrain, first_image = 0.0, None
+    seconds_pretrain, seconds_preview, first_image = 0.0, 0.0, None
 
     def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
         row = benchmark.make_row(
@@ -103,10 +103,14 @@ def render(
         start = budget.clock()
 
         def advance(done: float, total: float) -> None:
+            nonlocal seconds_preview
             progress(done, total)
-            late = first_image is None and done < total and budget.clock() - start > PREVIEW_SECONDS
-            if late and (so_far := budget.preview(loaded.scene, case.integrator, seed)) is not None:
+            now = budget.clock()
+            if first_image is not None or done >= total or now - start < PREVIEW_SECONDS:
+                return
+            if (so_far := budget.preview(loaded.scene, case.integrator, seed)) is not None:
                 keep(so_far)
+            seconds_preview += budget.clock() - now
 
         return advance
 
@@ -146,7 +150,7 @@ def render(
             rendered = budget.render_samples(
                 loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
             )
-        rendered.seconds_train += seconds_first
+        rendered.seconds_train += seconds_first - seconds_preview
         image, seconds_denoise = rendered.rgb, 0.0
         if denoise_:
             image, seconds_denoise = denoise.denoise(rendered.rgb, guides)
