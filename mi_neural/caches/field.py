@@ -167,6 +167,7 @@ class Weights:
             hashmap_size=shape.hashmap_size, base_resolution=shape.base_resolution,
             per_level_scale=shape.per_level_scale, init_scale=1e-2, rng=dr.rng(seed=2 * seed),
         )  # fmt: skip
+
         def layers():
             for _ in range(shape.n_hidden):
                 yield nn.Linear(-1, shape.width)
