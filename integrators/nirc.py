@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
 from mi_neural.caches.outgoing import OutgoingTraining
 from mi_neural.caches.pair import PairCache
@@ -23,6 +24,8 @@ AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE, LIGHT = range(7)
 
 
 class NIRCIntegrator(CacheIntegrator):
+    CHOOSES_LIGHTS = True
+
     def __init__(self, props):
         super().__init__(props)
         self.cache_samples = props.get("cache_samples", 4)
@@ -44,6 +47,18 @@ class NIRCIntegrator(CacheIntegrator):
             self.cache = PairCache(
                 training, self.cache.training, self.cache.shape, self.seed, n_queries=self.cache_samples
             )
+        if self.cache_samples == 0:
+            self.given["cache"] = False
+        if self.light_samples > 0:
+            self.given["light_samples"] = self.light_samples
+
+    def default_blend(self, props) -> str:
+        blends = self.plan_mode == "everything" and props.get("termination", "adaptive") != "auto"
+        return "reliability" if blends else "ema"
+
+    @property
+    def caches(self) -> tuple[str, ...]:
+        return ("outgoing", "incident") if self.termination == "auto" else ("incident",)
 
     @property
     def needs_cache(self) -> bool:
@@ -91,8 +106,10 @@ class NIRCIntegrator(CacheIntegrator):
         if self.cache.field is not None:
             level += float(self.cache.field.scale[0])
         noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
-        self.state.facts["direct_noise"] = float(noise)
-        self.state.facts["light_samples"] = 1 if noise < 0.02 else 2 if noise < 0.08 else 4
+        chosen = plan.light_samples(float(noise))
+        self.state.facts |= {"direct_noise": float(noise), "light_samples": chosen.value}
+        if self.state.plan is not None:
+            self.state.plan.decisions["light_samples"] = chosen
 
     def probe(self, field, x, sampler):
         return super().probe(getattr(field, "incident", field), x, sampler)
@@ -273,7 +290,7 @@ class NIRCIntegrator(CacheIntegrator):
             f"  light_samples = {self.n_light}{' (chosen)' if self.light_samples < 0 else ''},\n"
             f"  max_depth = {self.max_depth},\n"
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
-            f"  frames trained = {self.cache.steps}\n]"
+            f"  frames trained = {self.cache.steps},\n  plan = {self.state.plan or self.plan_mode}\n]"
         )
 
 
