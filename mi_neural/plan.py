@@ -50,7 +50,7 @@ class SceneFacts:
                   holes), mirror (no smooth lobe)
     textures      shapes with a textured BSDF
     roughness     least and largest `alpha` of BSDFs that say one; None without
-    film          (width, height) in pixels
+    film          (width, height) in pixels; None without a sensor
     extent        longest side of the scene's box, in its unit; None where that is not finite
     sensors       their number
     media         whether a shape borders a participating medium
@@ -62,7 +62,7 @@ class SceneFacts:
     surfaces: dict[str, int]
     textures: int
     roughness: tuple[float, float] | None
-    film: tuple[int, int]
+    film: tuple[int, int] | None
     extent: float | None
     sensors: int
     media: bool
@@ -89,7 +89,8 @@ class SceneFacts:
         box = np.array(scene.bbox().extents(), np.float64).ravel()
         return cls(
             emitters, triangles, lights, surfaces, textures, (min(alphas), max(alphas)) if alphas else None,
-            tuple(int(n) for n in sensor.film().crop_size()), float(box.max()) if np.isfinite(box).all() else None,
+            None if sensor is None else tuple(int(n) for n in sensor.film().crop_size()),
+            float(box.max()) if np.isfinite(box).all() else None,
             len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()),
         )  # fmt: skip
 
@@ -255,7 +256,7 @@ def of_integrator(facts: SceneFacts, request: Request) -> ScenePlan:
                 decision = given(request.given[name], f"else {decision}: {decision.because}")
             plan.decisions[name] = decision
     for name, size in request.sizes.items():
-        plan.decisions[name] = modelled(size, "the same in all scenes, as measured (README)")
+        plan.decisions[name] = modelled(size, "the same in all scenes (README: measured)")
         if name in request.given:
             plan.decisions[name] = given(request.given[name], f"else {size}")
     return plan
@@ -337,6 +338,8 @@ def _environment(facts: SceneFacts, request: Request) -> Decision:
 def _reliability(request: Request) -> Decision:
     if request.blend in ("reliability", "switch"):
         return modelled(True, f"blend is {request.blend}: two sets of weights are scored by place")
+    if request.blend == "control":
+        return modelled("alpha", "the cache is a control variate: how far it is believed is measured by place")
     return left_out(f"blend is {request.blend}: one set of weights answers everywhere")
 
 
