@@ -439,9 +439,9 @@ def _variance(e: np.ndarray, v: np.ndarray, pmf: np.ndarray, counts: np.ndarray)
     """Mean relative variance of one light chosen by `pmf`, not normalised; arrays (lights, points). Only lights that
     `counts` names have a part in it."""
     total = (e * v).sum(axis=0)
-    level = total.mean() if total.size else 0.0
-    if not level > 0:
+    if not (total > 0).any():
         return 0.0
+    level = np.median(total[total > 0])  # points on a lamp itself are brighter by far
     pmf = np.broadcast_to(pmf, e.shape)
     pmf = (pmf / np.maximum(pmf.sum(axis=0), 1e-300))[counts]
     e, v = e[counts], v[counts]

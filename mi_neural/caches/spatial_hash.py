@@ -21,6 +21,8 @@ from . import encoding, loss
 from .field import TrainedField, own_copy
 from .incident import TARGET_MAX, IncidentCache
 
+#: Means reach back this many times as far as averaged weights do: they have no other way to be rid of noise.
+MEMORY = 6.0
 #: Numbers of an entry: the sums of three colours and of weights.
 N_VALUES = 4
 
@@ -36,8 +38,8 @@ class HashShape:
     prior          κ, records that the coarser levels count as
     """
 
-    n_levels: int = 4
-    hashmap_size: int = 2**16
+    n_levels: int = 3
+    hashmap_size: int = 2**18
     base_resolution: int = 6
     per_level_scale: float = 2.0
     n_bins: int = 4
@@ -219,6 +221,7 @@ class SpatialHashCache(IncidentCache):
             dr.eval(y, error, level, said)
             outputs = [dr.sum(v) / n_valid for v in (error, level, said)]
             cache.mean = dr.lerp(outputs[1], cache.mean, decay)
-            cache.add(records.position, records.direction, y, records.valid, decay)
+            kept = 1 - (1 - decay) / MEMORY
+            cache.add(records.position, records.direction, y, records.valid, kept)
             dr.eval(outputs, cache.mean)
         return tuple(outputs)
