@@ -285,7 +285,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             try:
                 self._meet(scene, known is not self.state.watch.parts)
                 if self.state.plan is None or known is not self.state.watch.parts:
-                    planning.follow(self, self.make_plan(scene, sensor))
+                    planning.follow(self, planning.make_plan(self, scene, sensor))
             except ValueError:
                 self.state.watch.parts = known
                 raise
@@ -331,7 +331,9 @@ class CacheIntegrator(mi.SamplingIntegrator):
 
     def make_plan(self, scene, sensor=0) -> plan.ScenePlan:
         """What will be built in `scene`, what is left out, and why. Changes nothing."""
-        return planning.make_plan(self, scene, self._sensor(scene, sensor))
+        sensor = self._sensor(scene, sensor)
+        check_scene(scene, self.plugin)
+        return planning.make_plan(self, scene, sensor)
 
     def _train_first(self, scene, sensor, progress=None) -> None:
         auto = self.train_frames < 0

@@ -8,7 +8,6 @@ from functools import partial
 import mitsuba as mi
 
 from mi_neural import plan
-from mi_neural.integrators.checks import check_scene
 
 #: Keys of the network's sizes, as fields of its shape.
 SIZES = {"levels": "n_levels", "hashmap_size": "hashmap_size", "width": "width", "hidden_layers": "n_hidden"}
@@ -16,12 +15,11 @@ SIZES = {"levels": "n_levels", "hashmap_size": "hashmap_size", "width": "width",
 
 def make_plan(integrator, scene, sensor) -> plan.ScenePlan:
     """The plan of an integrator in a scene, that of its light sampler included. Changes neither."""
-    check_scene(scene, integrator.plugin)
     facts = plan.SceneFacts.read(scene, sensor)
-    shape = integrator.cache.shape
+    default = type(integrator.cache.shape)()
     request = plan.Request(
         integrator.plugin, integrator.plan_mode, integrator.given, integrator.caches, integrator.max_depth,
-        integrator.cache.blend, {key: getattr(shape, name) for key, name in SIZES.items() if hasattr(shape, name)},
+        integrator.cache.blend, {key: getattr(default, name) for key, name in SIZES.items() if hasattr(default, name)},
         partial(plan.light_noise, scene, sensor) if integrator.CHOOSES_LIGHTS else None,
     )  # fmt: skip
     made = plan.of_integrator(facts, request)

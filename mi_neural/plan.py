@@ -8,6 +8,7 @@ fixed is `given`. In the mode ``everything`` all parts are built that can be, fo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
@@ -19,7 +20,7 @@ from .caches.outgoing import INPUTS
 from .caches.visibility import surface_point
 from .lights.clusters import make_groups
 from .lights.sampling import VISIBILITY_FLOOR, Columns, PowerLights
-from .lights.table import ENVIRONMENT, LightTable, importance
+from .lights.table import ENVIRONMENT, LOCAL, LightTable, importance
 from .transport.freezing import undisturbed
 from .transport.samples import PathSampler
 
@@ -30,6 +31,8 @@ MOST_OUTPUTS = 32
 #: and what was gained in equal time: 0.01 (32 lamps) 5 times, 0.1 (24,576 triangles) 13 times, 0.19 (staircase of 13
 #: lights, frames 1.6 times as long) nothing. And power is worth its own code where it leaves less than the second.
 WORTH_SHARE, WORTH_POWER = 0.15, 0.8
+#: More lights than this are not looked at: a table of them would take seconds and gigabytes unasked.
+MOST_LOOKED_AT = 2**18
 #: Noise of direct light from which on 2, and 4, samples of it are taken per camera sample.
 TWO_SAMPLES, FOUR_SAMPLES = 0.02, 0.08
 #: Points that lights are looked at from.
@@ -313,7 +316,7 @@ def _light_sampler(facts: SceneFacts, request: Request) -> Decision:
         return given(request.given["light_sampler"], f"lights: {n}")
     if n < 2:
         return left_out(f"nothing to choose, lights: {n}")
-    if request.look is None:
+    if request.look is None or n > MOST_LOOKED_AT:
         return left_out(f"the scene's own choice among {n} lights; nest one to have another")
     noise = request.look()
     figures = f"variance of direct light, {n} lights: {noise}"
@@ -375,7 +378,7 @@ def light_samples(noise: float) -> Decision:
 @dataclass(frozen=True)
 class LightNoise:
     """Relative variance that the choice of a light adds to direct light, over surfaces that the camera sees and those
-    one bounce further: chosen uniformly, by power, and by what is visible."""
+    one bounce further: chosen uniformly, by power, and by what is visible (infinite where that cannot be done)."""
 
     uniform: float
     power: float
@@ -395,7 +398,8 @@ def light_noise(scene, sensor, n_points: int = N_POINTS, n_rays: int = 4, seed: 
     """
     with dr.suspend_grad(), undisturbed():
         table = LightTable(scene)
-        groups = make_groups(table, MOST_OUTPUTS, "auto", seed)
+        far = int((table.columns["kind"] != LOCAL).sum())  # never clustered
+        groups = make_groups(table, max(MOST_OUTPUTS, far + 1), "auto", seed)
         k, n = groups.n_groups, n_points
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(seed), index=lane, scramble=mi.UInt32(seed))
@@ -432,7 +436,8 @@ def light_noise(scene, sensor, n_points: int = N_POINTS, n_rays: int = 4, seed: 
     power = np.bincount(label, np.array(PowerLights(table).groups.within, np.float64))
     visible = e * np.maximum(v, VISIBILITY_FLOOR)
     counts = np.array(groups.kind) != ENVIRONMENT
-    return LightNoise(*(_variance(e, v, pmf, counts) for pmf in (uniform[:, None], power[:, None], visible)))
+    noise = [_variance(e, v, pmf, counts) for pmf in (uniform[:, None], power[:, None], visible)]
+    return LightNoise(*noise[:2], noise[2] if far < MOST_OUTPUTS else math.inf)
 
 
 def _variance(e: np.ndarray, v: np.ndarray, pmf: np.ndarray, counts: np.ndarray) -> float:

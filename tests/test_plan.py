@@ -171,6 +171,17 @@ def test_noise_of_a_choice_is_known_where_one_light_is_seen(n_hidden, environmen
         assert noise.visibility < 0.06 * (n - 1)
 
 
+def test_forty_suns_are_looked_at_though_the_network_cannot_have_them():
+    """They are not clustered; an integrator that chooses by itself does without learned visibility there."""
+    suns = {f"sun{k}": {"type": "directional", "direction": [np.cos(k), np.sin(k), -1]} for k in range(40)}
+    scene = scene_of(suns)
+    camera = mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, -4, 4], [0, 0, 0],
+                                                                                            [0, 0, 1])})  # fmt: skip
+    noise = plan.light_noise(scene, camera, n_points=64)
+    assert np.isinf(noise.visibility) and noise.uniform < 0.5
+    assert not planned(facts(40), look=lambda: noise).modelled("light_sampler")
+
+
 # ---------------------------------------------------------------- what is built
 
 

@@ -112,7 +112,8 @@ def measure(
             errors[name].append(judged([image for _, image in found]))
         fits = max(1, round(spp * seconds[EVERYTHING][-1] / seconds[PLANNED][-1]))
         more.append(fits)
-        errors[EQUAL_TIME].append(judged([frame(PLANNED, fits, budget.pass_seed(r, 9, k))[1] for k in range(images)]))
+        seeds = [budget.pass_seed(r, budget.STREAM_IMAGE, images + k) for k in range(images)]
+        errors[EQUAL_TIME].append(judged([frame(PLANNED, fits, seed)[1] for seed in seeds]))
         if progress:
             progress(r + 1, repeats)
 
