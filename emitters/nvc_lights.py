@@ -115,6 +115,10 @@ class NVCLightSampler(LightSampler):
         if self.sampler is not None:
             self.sampler.field = None
 
+    def reseed(self, seed: int) -> None:
+        self.cache.seed = seed
+        self.reset()
+
     def make(self, scene, table):
         try:
             cells = int(self.plan["environment_cells"])

@@ -374,13 +374,9 @@ NIRCIntegrator.__doc__ = (
        - Constant c of the spread test a > c a_0; 0: no surface is too near. (Default: 0.01)
      * - gather_half
        - |float|
-       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)
-    """
-    + SHARED_KEYS.strip("\n")
-    + r"""
-
-    """
-    + AUTO.strip("\n")
+       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)"""
+    + SHARED_KEYS
+    + AUTO
     + r"""
     It traces one BSDF sample a vertex (``light_samples``, ``gather_half`` have no effect).
 

@@ -210,13 +210,9 @@ NRCIntegrator.__doc__ = (
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first
-         vertex, mirrors or glass): less noise in the records, some bias. (Default: 0)
-    """
-    + SHARED_KEYS.strip("\n")
-    + r"""
-
-    """
-    + AUTO.strip("\n")
+         vertex, mirrors or glass): less noise in the records, some bias. (Default: 0)"""
+    + SHARED_KEYS
+    + AUTO
     + r"""
     The incident cache is asked in 4 directions; ``cache_content`` must be ``reflected``.
 

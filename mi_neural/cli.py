@@ -10,6 +10,7 @@ from __future__ import annotations
 import typer
 
 from mi_neural.commands.compare import compare
+from mi_neural.commands.doc import doc
 from mi_neural.commands.info import info
 from mi_neural.commands.plan import plan
 from mi_neural.commands.render import render
@@ -28,6 +29,7 @@ app.command()(compare)
 app.command()(sequence)
 app.command()(plan)
 app.command()(info)
+app.command()(doc)
 
 
 def main() -> None:

@@ -45,14 +45,6 @@ class ControlVariate:
         dr.make_opaque(self.alpha)
 
     @property
-    def box_min(self):
-        return self.field.box_min
-
-    @property
-    def box_inv_extent(self):
-        return self.field.box_inv_extent
-
-    @property
     def scale(self):
         return self.field.scale
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, terminal
+from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, repeats, terminal
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
@@ -140,7 +140,7 @@ def render(
         exr.write_text(json_, json.dumps(row.to_json(), indent=1) + "\n")
     if save_cache is not None:
         case.integrator.save_cache(str(save_cache))
-    terminal.print_rows([row])
+    terminal.print_rows(repeats.group([row]))
     terminal.out.print(f"wrote {output}", soft_wrap=True, markup=False)
     if rendered.interrupted:
         raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")
