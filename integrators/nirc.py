@@ -12,8 +12,9 @@ from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.integrators import automatic
 from mi_neural.integrators.automatic import AUTO
-from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.integrators.common import CacheIntegrator
 from mi_neural.integrators.first_vertex import first_vertex
+from mi_neural.integrators.keys import SHARED_KEYS
 from mi_neural.integrators.planning import SIZES
 from mi_neural.transport import termination, vertex
 from mi_neural.transport.samples import PathSampler

@@ -12,7 +12,8 @@ from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape, OutgoingTrai
 from mi_neural.caches.pair import PairCache
 from mi_neural.integrators import automatic, prefix
 from mi_neural.integrators.automatic import AUTO
-from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.integrators.keys import SHARED_KEYS
 from mi_neural.transport.suffixes import surface_of
 
 #: Where paths end
