@@ -15,6 +15,8 @@ FILE_VERSION = 2
 #: What is said of a file that is not of the kind asked for.
 KINDS = {
     "incident": "holds no incident radiance alone; train an incident cache and save it",
+    "spatial_hash": "holds no spatial hash; train and save one with cache='spatial_hash'",
+    "sh_grid": "holds no grid of spherical harmonics; train and save one with cache='sh_grid'",
     "outgoing": "holds no outgoing radiance; train an outgoing cache and save it",
     "pair": "does not hold both incident and outgoing radiance; train and save a cache with termination='auto'",
 }
