@@ -1,0 +1,398 @@
+"""Beyond one machine: jobs on the workers of a Dask scheduler, and images put together from parts.
+
+    dask scheduler                                  # on one machine; says its address
+    dask worker tcp://HOST:8786 --nthreads 8        # on each machine, with mi_neural installed
+
+    from mi_neural.measure import cluster
+    image = cluster.render("scene.xml", "nirc", spp=4096, client="tcp://HOST:8786")
+
+A worker process renders with `--nthreads` threads and has one job at a time. The cache is trained here, once, and its
+file's bytes go to the workers, which train no more. An image is divided into passes as one process would divide it,
+with the same random numbers, and merged by sample count (:class:`~mi_neural.measure.moments.Moments`): it is the image
+of one process up to the order of summation, except for what a worker measures or learns by itself (a light sampler's
+visibility, the pilot of `nirc_two_level`), which changes noise and no mean.
+
+A worker that dies is replaced: Dask hands its job to another, and a worker's nanny starts it anew. Needs the extra
+`cluster` (`distributed`).
+"""
+
+from __future__ import annotations
+
+import queue
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from . import benchmark, budget, environment, exr, jobs
+from .load import InputError, LoadedScene, load_scene, one_line, parse_integrator, split_channels
+from .moments import Moments
+
+#: Fewest passes of an image, as far as it has samples: their spread says what the variance is.
+LEAST_PASSES = 16
+#: Parts of an image for each worker. More share the work more evenly, fewer send less.
+PARTS_PER_WORKER = 8
+#: Seconds to wait for the scheduler's answer, and for a worker where there is none (any more).
+CONNECT_SECONDS, PATIENCE = 10.0, 60.0
+#: Seconds between two looks at who is there.
+LOOK_SECONDS = 1.0
+
+
+class ClusterError(InputError):
+    """The cluster cannot do what it is asked; the message is one line and complete."""
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# On a worker
+
+
+@dataclass
+class Answer:
+    """What a job gave, and on which worker; `environment` as of a measurement."""
+
+    value: object
+    worker: str
+    environment: dict[str, object]
+
+
+@cache
+def _renderer(threads: int) -> ThreadPoolExecutor:
+    """The one thread of a worker process that ever meets Mitsuba: jobs queue up, however many Dask hands out."""
+    import drjit as dr
+
+    return ThreadPoolExecutor(1, "mi_neural", dr.set_thread_count, (threads,))
+
+
+def work(job, *data) -> Answer:
+    """Run a job on the worker that this is called on; what the user can mend comes back as one line."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    name = f"{worker.address} ({socket.gethostname()})"
+
+    def run() -> Answer:
+        return Answer(job.run(*data), worker.address, environment.describe())
+
+    try:
+        return _renderer(worker.state.nthreads).submit(run).result()
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        raise ClusterError(f"worker {name}: {one_line(error)}") from None
+
+
+def _same(data):
+    return data
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Here
+
+
+def _distributed():
+    try:
+        import distributed
+    except ImportError:
+        raise ImportError("a cluster needs Dask; type: pip install 'mi_neural[cluster]'") from None
+    return distributed
+
+
+@contextmanager
+def connect(client, patience: float = PATIENCE):
+    """The :class:`Workers` of a ``distributed.Client``, or of a scheduler's address; None: this process alone.
+
+    Raises ``ImportError`` without `distributed`, :class:`ClusterError` where no scheduler answers.
+    """
+    if client is None:
+        yield None
+        return
+    distributed = _distributed()
+    if not isinstance(client, str):
+        yield Workers(client, patience)
+        return
+    try:
+        distributed.comm.get_address_host_port(client, strict=True)  # first: a Client cannot be made of nonsense
+        made = distributed.Client(client, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ClusterError(
+            f"no Dask scheduler answers at {client!r} ({one_line(error)}): type `dask scheduler` on that machine, give "
+            "the address that it prints, like tcp://HOST:8786"
+        ) from None
+    with made:
+        yield Workers(made, patience)
+
+
+class Workers:
+    """The worker processes of a cluster, each with one job of ours at a time."""
+
+    def __init__(self, client, patience: float = PATIENCE) -> None:
+        self.client, self.patience = client, patience
+        self.address = client.scheduler.address
+
+    def names(self) -> list[str]:
+        """Addresses of the workers that are there now."""
+        try:
+            return list(self.client.nthreads())
+        except (OSError, RuntimeError, ValueError) as error:
+            raise self._no_scheduler(error) from None
+
+    def count(self) -> int:
+        """Number of workers; waits for the first one. Raises :class:`ClusterError` if none comes."""
+        start = time.monotonic()
+        while not (names := self.names()):
+            self._still_hope(start)
+            time.sleep(LOOK_SECONDS / 4)
+        return len(names)
+
+    def map(self, job_list: Sequence, data: object = None) -> Iterator[tuple[int, Answer]]:
+        """Run jobs, each with `data` (sent once); yields (index, answer) as they are done, in any order.
+
+        A job whose worker dies is run by another. Whoever stops listening, by an exception or otherwise, cancels what
+        has not begun. Raises :class:`ClusterError`: a job failed, took several workers with it, no worker or no
+        scheduler is there any more.
+        """
+        import dask
+
+        waiting, running, finished = deque(enumerate(job_list)), {}, queue.SimpleQueue()
+        seen = time.monotonic()
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
+            # A task and not scattered data: it is made anew where all workers that held it are gone
+            sent = () if data is None else (self.client.submit(_same, data, pure=False),)
+        try:
+            while waiting or running:
+                names = self.names()
+                if names:
+                    seen = time.monotonic()
+                self._still_hope(seen)
+                busy = {name for _, name in running.values()}
+                for name in names:
+                    if waiting and name not in busy:
+                        index, job = waiting.popleft()
+                        future = self.client.submit(
+                            work, job, *sent, workers=[name], allow_other_workers=True, pure=False
+                        )
+                        running[future] = index, name
+                        future.add_done_callback(finished.put)
+                try:
+                    future = finished.get(timeout=LOOK_SECONDS)
+                except queue.Empty:
+                    continue
+                index, _ = running.pop(future)
+                yield index, self._result(future)
+        finally:
+            if running and self.client.status == "running":
+                self.client.cancel(list(running), force=True)
+
+    def _result(self, future) -> Answer:
+        distributed = _distributed()
+        try:
+            return future.result()
+        except ClusterError:
+            raise
+        except distributed.KilledWorker as error:
+            raise ClusterError(
+                f"a job ended {1 + error.allowed_failures} workers, one after the other, the last at "
+                f"{error.last_worker.address}: look at its log; if its memory was too small, start the workers with a "
+                "larger --memory-limit"
+            ) from None
+        except ModuleNotFoundError as error:
+            raise ClusterError(
+                f"a worker cannot import {error.name}: in its environment type pip install 'mi_neural[cluster]'"
+            ) from None
+        except (distributed.CancelledError, OSError) as error:
+            raise self._no_scheduler(error) from None
+
+    def _still_hope(self, since: float) -> None:
+        if time.monotonic() - since > self.patience:
+            raise ClusterError(
+                f"no worker at {self.address} for {self.patience:g} s: start one with "
+                f"`dask worker {self.address} --nthreads N`"
+            )
+
+    def _no_scheduler(self, error: BaseException) -> ClusterError:
+        return ClusterError(
+            f"the scheduler at {self.address} does not answer any more ({one_line(error)}): start it again with `dask "
+            "scheduler`, and the workers after it"
+        )
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# One image in parts
+
+
+def plan_passes(scene, spp: int) -> list[int]:
+    """Samples a pixel of each pass: those of :func:`budget.plan_passes` if they are LEAST_PASSES, else smaller ones.
+
+    They depend on film and `spp` alone, not on the number of workers.
+    """
+    passes = budget.plan_passes(scene, spp)
+    if len(passes) >= LEAST_PASSES:
+        return passes
+    size = 1
+    while 2 * size * LEAST_PASSES <= spp:
+        size *= 2
+    return [size] * (spp // size) + ([spp % size] if spp % size else [])
+
+
+def plan_parts(setup: jobs.Setup, passes: list[int], n_parts: int, seed: int) -> list[jobs.Part]:
+    """Neighbouring passes as `n_parts` jobs, or as many as there are passes."""
+    n_parts = max(1, min(n_parts, len(passes)))
+    edges = [k * len(passes) // n_parts for k in range(n_parts + 1)]
+    return [jobs.Part(setup, a, tuple(passes[a:b]), sum(passes), seed) for a, b in pairwise(edges)]
+
+
+def check(case: benchmark.Case, over_time: bool = False) -> None:
+    """Raise :class:`ClusterError` where parts of an image (`over_time`: frames) cannot be rendered apart."""
+    integrator, name = case.integrator, case.spec.type
+    if getattr(integrator, "cumulative", False):
+        raise ClusterError(f"{name} makes its image of all samples together (mode=progressive): leave the mode out")
+    if getattr(integrator, "history", 0) > 0:
+        raise ClusterError(f"{name} reuses the images before (history={integrator.history:g}): add history=0")
+    if over_time and getattr(integrator, "train_steps", 0) > 0 and not getattr(integrator, "freeze_cache", False):
+        raise ClusterError(
+            f"{name} trains before each frame (train_steps={integrator.train_steps}): add train_steps=0, with which it "
+            "trains before the first one only"
+        )
+
+
+def render_samples(
+    setup: jobs.Setup,
+    loaded: LoadedScene,
+    case: benchmark.Case,
+    spp: int,
+    seed: int = 0,
+    workers: Workers | None = None,
+    progress: budget.Progress | None = None,
+    keep: Callable[[budget.Rendered], None] | None = None,
+) -> budget.Rendered:
+    """`spp` samples a pixel by all workers, with what the case's integrator has learned; None: by this process.
+
+    As :func:`budget.render_samples`, with these differences. Channels `variance.R G B` hold the variance of the mean.
+    `seconds_render` is wall time here, the workers' compiling included; `statistics` count their `queries`, and say how
+    many `workers` and `parts` there were. Ctrl-C, and the loss of all workers, leave the image of the parts that are
+    done; `problem` says so.
+
+    Raises :class:`ClusterError`.
+    """
+    passes = plan_passes(loaded.scene, spp)
+    if workers is None:
+        film = Moments()
+        rendered = budget.render_passes(
+            loaded.scene, case.integrator, passes, spp, seed=seed, progress=progress, keep=keep, film=film
+        )
+        return _with_variance(rendered, case.integrator, film)
+    check(case)
+    merged = _Merged(case.integrator)
+    kept = budget.clock()
+    try:
+        parts = plan_parts(setup, passes, PARTS_PER_WORKER * workers.count(), seed)
+        for _, answer in workers.map(parts, jobs.cache_bytes(case.integrator)):
+            merged.add(answer)
+            if progress:
+                progress(merged.film.spp, spp)
+            if keep is not None and budget.clock() - kept > budget.KEEP_SECONDS:
+                keep(merged.result(interrupted=True))
+                kept = budget.clock()
+    except KeyboardInterrupt:
+        return merged.result(interrupted=True)
+    except ClusterError as error:
+        if not merged.film.spp:
+            raise
+        return merged.result(interrupted=True, problem=str(error))
+    return merged.result()
+
+
+class _Merged:
+    """The parts of an image that are done."""
+
+    def __init__(self, integrator) -> None:
+        self.integrator, self.film, self.start = integrator, Moments(), budget.clock()
+        self.counts: Counter[str] = Counter()
+        self.parts: Counter[str] = Counter()
+
+    def add(self, answer: Answer) -> None:
+        film, counts = answer.value
+        self.film.merge(film)
+        self.counts.update(counts)
+        self.parts[answer.worker] += 1
+
+    def result(self, **ended) -> budget.Rendered:
+        if not self.film.spp:
+            raise KeyboardInterrupt("interrupted before the first samples were there")
+        rendered = budget.Rendered(
+            rgb=None, channels={}, spp=self.film.spp, nonfinite=self.film.nonfinite,
+            seconds_train=0.0, seconds_render=budget.clock() - self.start,
+            statistics={
+                **budget.statistics(self.integrator), **self.counts,
+                "workers": len(self.parts), "parts": self.parts.total(),
+            }, **ended,
+        )  # fmt: skip
+        return _with_variance(rendered, self.integrator, self.film)
+
+
+def _with_variance(rendered: budget.Rendered, integrator, film: Moments) -> budget.Rendered:
+    """The image of `film`, with the variance of its mean among the channels."""
+    names = list(integrator.aov_names()) if hasattr(integrator, "aov_names") else []
+    rgb, channels = split_channels(film.mean(), names)
+    channels = {name: values.astype(np.float32) for name, values in channels.items()}
+    if (variance := film.variance()) is not None:
+        channels.update(exr.layer_channels("variance", split_channels(variance, names)[0].astype(np.float32)))
+    return replace(rendered, rgb=rgb.astype(np.float32), channels=channels)
+
+
+def render(
+    scene: str | Path,
+    integrator: str | None = None,
+    spp: int | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+    parameters: dict[str, str] | None = None,
+    pretrain: int = 0,
+    cache: str | Path | None = None,
+    seed: int = 0,
+    client=None,
+    patience: float = PATIENCE,
+    progress: budget.Progress | None = None,
+) -> budget.Rendered:
+    """Render a scene file, or a shipped scene, on a cluster.
+
+    integrator  `nirc` or `nirc:termination=auto,cache_samples=8`; None: the scene's own
+    spp         samples a pixel; None: what the scene says
+    size        (width, height) of the film; None: the scene's own
+    parameters  values for the scene's `$parameters`
+    pretrain    frames to train here before; what the integrator itself trains before a first image comes on top
+    cache       a cache file to start from
+    client      a ``distributed.Client``, the address of a scheduler, or None: this process renders all by itself
+    patience    seconds to wait for a worker where there is none (any more)
+    progress    called with (samples a pixel done, all)
+
+    Returns a :class:`~mi_neural.measure.budget.Rendered`: `rgb` of shape (height, width, 3), and the variance of that
+    mean in ``channels["variance.R"]``, `G`, `B`. Raises :class:`InputError` and :class:`ClusterError`.
+    """
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        raise InputError('no Mitsuba variant is set; type: mi.set_variant("llvm_ad_rgb")')
+    loaded = load_scene(str(scene), size, parameters)
+    if integrator is None:
+        case = benchmark.own_case(loaded, {})
+    else:
+        case = benchmark.make_cases(loaded, [parse_integrator(integrator)])[0]
+    with connect(client, patience) as workers:
+        if cache is not None:
+            case.integrator.load_cache(str(cache), loaded.scene)
+        seconds_train, stopped = budget.train(loaded.scene, case.integrator, pretrain)
+        if not stopped:
+            seconds_first, stopped = budget.train_first(loaded.scene, case.integrator)
+            seconds_train += seconds_first
+        if stopped:
+            raise KeyboardInterrupt("interrupted while training")
+        setup = jobs.Setup.of(loaded, case, size, own=integrator is None)
+        rendered = render_samples(setup, loaded, case, spp or loaded.default_spp, seed, workers, progress)
+    return replace(rendered, seconds_train=rendered.seconds_train + seconds_train)
