@@ -22,7 +22,7 @@ import queue
 import socket
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import benchmark, budget, environment, exr, jobs
+from . import benchmark, budget, environment, exr, jobs, sequence
 from .load import InputError, LoadedScene, load_scene, one_line, parse_integrator, split_channels
 from .moments import Moments
 
@@ -117,8 +117,10 @@ def connect(client, patience: float = PATIENCE):
         yield Workers(client, patience)
         return
     try:
-        distributed.comm.get_address_host_port(client, strict=True)  # first: a Client cannot be made of nonsense
-        made = distributed.Client(client, timeout=CONNECT_SECONDS, set_as_default=False)
+        # First, since a Client cannot be made of nonsense and then be forgotten
+        address = distributed.comm.normalize_address(client)
+        distributed.comm.get_address_host_port(address, strict=True)
+        made = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ClusterError(
             f"no Dask scheduler answers at {client!r} ({one_line(error)}): type `dask scheduler` on that machine, give "
@@ -150,7 +152,7 @@ class Workers:
             time.sleep(LOOK_SECONDS / 4)
         return len(names)
 
-    def map(self, job_list: Sequence, data: object = None) -> Iterator[tuple[int, Answer]]:
+    def map(self, job_list: list, data: object = None) -> Iterator[tuple[int, Answer]]:
         """Run jobs, each with `data` (sent once); yields (index, answer) as they are done, in any order.
 
         A job whose worker dies is run by another. Whoever stops listening, by an exception or otherwise, cancels what
@@ -344,6 +346,30 @@ def _with_variance(rendered: budget.Rendered, integrator, film: Moments) -> budg
     if (variance := film.variance()) is not None:
         channels.update(exr.layer_channels("variance", split_channels(variance, names)[0].astype(np.float32)))
     return replace(rendered, rgb=rgb.astype(np.float32), channels=channels)
+
+
+def frames_of(
+    workers: Workers, loaded: LoadedScene, size: tuple[int, int] | None, texts: list[str], over_time: sequence.Sequence,
+    plan: sequence.Plan,
+) -> Callable[[benchmark.Case, range], Iterator[sequence.Frame]]:  # fmt: skip
+    """What has the workers render frames for a :class:`sequence.Run`; `texts`: the changes as typed, `KEY=EXPR`."""
+
+    def render(case: benchmark.Case, frames: range) -> Iterator[sequence.Frame]:
+        setup = jobs.Setup.of(loaded, case, size, merge=False)
+        job_list = [
+            jobs.Frame(setup, tuple(texts), over_time.frames, over_time.change_at, frame, plan.spp, plan.seed)
+            for frame in frames
+        ]
+        early: dict[int, sequence.Frame] = {}
+        following = 0
+        for index, answer in workers.map(job_list, jobs.cache_bytes(case.integrator)):
+            rendered, seconds_update = answer.value
+            early[index] = sequence.Frame(rendered, seconds_update, answer.environment)
+            while following in early:
+                yield early.pop(following)
+                following += 1
+
+    return render
 
 
 def render(

@@ -1,0 +1,219 @@
+"""Beyond one machine: images put together from parts, on a real cluster of two worker processes, one of them killed.
+
+The workers compile their kernels as the tests do (`quick_kernels` as Dask's preload). Skips where Dask is missing.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mi_neural.measure import benchmark, budget, cluster, jobs, load
+from mi_neural.measure.load import InputError
+from mi_neural.measure.moments import Moments
+
+distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'mi_neural[cluster]'")
+
+SIZE, SPP = (16, 16), 64
+#: False alarms per statistical test.
+ERROR_RATE = 1e-4
+NIRC = "nirc:levels=2,hashmap_size=512,width=16,train_samples=256,train_frames=4,train_steps=0"
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """The address of a scheduler without workers."""
+    folder = tmp_path_factory.mktemp("cluster")
+    file = folder / "scheduler.json"
+    process = start("scheduler", "--port", "0", "--scheduler-file", file, folder=folder)
+    deadline = time.monotonic() + 60
+    while not file.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    yield json.loads(file.read_text())["address"]
+    end(process)
+
+
+@pytest.fixture(scope="module")
+def address(scheduler, tmp_path_factory):
+    """The same scheduler with two workers of one thread each, and a nanny each that starts it anew."""
+    process = workers_at(scheduler, tmp_path_factory.mktemp("workers"))
+    with distributed.Client(scheduler, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=60)
+    yield scheduler
+    end(process)
+
+
+def workers_at(scheduler: str, folder: Path, n: int = 2) -> subprocess.Popen:
+    preload = Path(__file__).with_name("quick_kernels.py")
+    return start("worker", scheduler, "--nworkers", n, "--nthreads", 1, "--preload", preload, folder=folder)
+
+
+def start(kind: str, *arguments, folder: Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *map(str, arguments), "--no-dashboard"]
+    with open(folder / f"{kind}.log", "w") as log:
+        return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+
+
+def end(process: subprocess.Popen) -> None:
+    process.terminate()
+    try:
+        process.wait(timeout=10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def pids(address: str) -> dict[str, int]:
+    """Process of each worker."""
+    with distributed.Client(address, set_as_default=False) as client:
+        return client.run(os.getpid)
+
+
+def render(integrator: str = "path", client: str | None = None, spp: int = SPP, **options) -> budget.Rendered:
+    return cluster.render("cornell_box", integrator, spp, size=SIZE, client=client, **options)
+
+
+def variance(rendered: budget.Rendered) -> np.ndarray:
+    return np.stack([rendered.channels[f"variance.{c}"] for c in "RGB"], axis=-1)
+
+
+# ---------------------------------------------------------------- mean and variance of parts
+
+
+def passes(rng, sizes, n: int = 1) -> list[np.ndarray]:
+    """A pass of each size: n x 1 pixels of mean 2, of variance 1 a sample."""
+    return [2.0 + rng.standard_normal((n, 1, 1)) / np.sqrt(size) for size in sizes]
+
+
+def merged(images, sizes, edges=()) -> Moments:
+    """The passes, in parts that end before the numbers `edges`."""
+    whole = Moments()
+    for part in np.split(np.arange(len(sizes)), edges):
+        moments = Moments()
+        for k in part:
+            moments.add(images[k], sizes[k])
+        whole.merge(moments)
+    return whole
+
+
+def test_passes_of_one_size_have_the_textbook_variance(rng):
+    sizes = [4] * 10
+    images = passes(rng, sizes, 50)
+    moments = merged(images, sizes)
+    np.testing.assert_allclose(moments.mean(), np.mean(images, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(moments.variance(), np.var(images, axis=0, ddof=1) / 10, rtol=1e-5)
+    assert moments.spp == 40
+
+
+def test_mean_and_variance_do_not_depend_on_the_parts(rng):
+    sizes = [4, 4, 4, 4, 1, 2]
+    images = passes(rng, sizes, 20)
+    images[3][5] = np.nan
+    whole = merged(images, sizes)
+    for edges in [(1,), (3, 5), (1, 2, 3, 4, 5), (0, 6)]:
+        parts = merged(images, sizes, edges)
+        np.testing.assert_allclose(parts.mean(), whole.mean(), rtol=1e-6)
+        np.testing.assert_allclose(parts.variance(), whole.variance(), rtol=1e-5)
+        assert (parts.spp, parts.nonfinite) == (19, 1)
+    without = merged([i[5:6] for k, i in enumerate(images) if k != 3], [4, 4, 4, 1, 2])
+    np.testing.assert_allclose(whole.variance()[5], without.variance()[0], rtol=1e-5)
+
+
+def test_variance_is_right_on_average_for_passes_of_any_size(rng):
+    """Means of both are compared with the truth over many pixels; error rate as above, each."""
+    sizes = [8, 8, 1, 2, 8]
+    n, total = 20_000, sum(sizes)
+    moments = merged(passes(rng, sizes, n), sizes, (2,))
+    found = moments.variance().astype(np.float64).ravel()
+    bound = stats.norm.isf(ERROR_RATE / 2)
+    print(f"variance {found.mean():.5f}, true {1 / total:.5f}")
+    assert abs(found.mean() - 1 / total) <= bound * found.std(ddof=1) / np.sqrt(n)
+    assert abs(moments.mean().astype(np.float64).mean() - 2.0) <= bound / np.sqrt(total * n)
+
+
+def test_one_pass_says_nothing_about_its_variance(rng):
+    assert merged(passes(rng, [4]), [4]).variance() is None
+    images = passes(rng, [4, 4], 2)
+    images[1][1] = np.inf
+    assert np.isinf(merged(images, [4, 4]).variance()[1]) and np.isfinite(merged(images, [4, 4]).mean()).all()
+
+
+# ---------------------------------------------------------------- how an image is divided
+
+
+def setup_of(integrator: str = "path") -> tuple[jobs.Setup, load.LoadedScene, benchmark.Case]:
+    loaded = load.load_scene("cornell_box", SIZE)
+    case = benchmark.make_cases(loaded, [load.parse_integrator(integrator)])[0]
+    return jobs.Setup.of(loaded, case, SIZE), loaded, case
+
+
+@pytest.mark.parametrize("spp", [1, 5, 64, 100])
+def test_parts_hold_every_pass_once_whatever_their_number(spp):
+    setup, loaded, _ = setup_of()
+    planned = cluster.plan_passes(loaded.scene, spp)
+    assert sum(planned) == spp and len(planned) >= min(spp, cluster.LEAST_PASSES)
+    for n in (1, 3, 16, 1000):
+        parts = cluster.plan_parts(setup, planned, n, 0)
+        assert [p.first for p in parts] == list(np.cumsum([0, *(len(p.passes) for p in parts)])[:-1])
+        assert [size for p in parts for size in p.passes] == planned
+        assert len(parts) == min(n, len(planned)) and all(p.spp == spp for p in parts)
+
+
+def test_passes_are_those_of_one_process_where_it_has_many(monkeypatch):
+    monkeypatch.setattr(budget, "PASS_SAMPLES", 4 * SIZE[0] * SIZE[1])
+    scene = load.load_scene("cornell_box", SIZE).scene
+    assert cluster.plan_passes(scene, 66) == budget.plan_passes(scene, 66) == [4] * 16 + [2]
+
+
+# ---------------------------------------------------------------- two workers
+
+
+def test_image_of_two_workers_is_that_of_one_process_although_one_is_killed(address):
+    """The same passes with the same numbers: equal up to the order of summation."""
+    before, victims = pids(address), []
+
+    def kill(done: float, total: float) -> None:
+        if not victims:
+            victims.append(next(iter(before.values())))
+            os.kill(victims[0], signal.SIGKILL)
+
+    found, known = render(client=address, progress=kill), render()
+    assert victims and found.spp == SPP and not found.interrupted
+    np.testing.assert_allclose(found.rgb, known.rgb, rtol=1e-5)
+    np.testing.assert_allclose(variance(found), variance(known), rtol=1e-4)
+
+    deadline = time.monotonic() + 30
+    while len(after := pids(address)) < 2 and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert len(after) == 2 and victims[0] not in after.values(), "its nanny starts it anew"
+
+
+def test_merged_image_and_another_of_one_process_differ_by_their_variances(address):
+    """Other random numbers: differences over their standard errors have mean square 1, pixel by pixel.
+
+    256 pixels, whose squares have a standard deviation of about 1.6: four of its errors on each side are 1 in 10,000.
+    """
+    a, b = render(client=address, seed=1), render(seed=2)
+    z = (a.rgb - b.rgb)[..., 1] / np.sqrt(variance(a) + variance(b))[..., 1]
+    print(f"mean of z {z.mean():.3f}, of its square {np.mean(z**2):.3f}")
+    assert abs(z.mean()) < stats.norm.isf(ERROR_RATE / 2) / np.sqrt(z.size)
+    assert abs(np.mean(z**2) - 1.0) < 4.0 * 1.6 / np.sqrt(z.size)
+
+
+def test_cache_is_trained_once_and_read_by_the_workers(address, tmp_path):
+    _, loaded, case = setup_of(NIRC)
+    case.integrator.train_first(loaded.scene)
+    file = tmp_path / "cache.npz"
+    case.integrator.save_cache(file)
+    found, known = render(NIRC, address, cache=file), render(NIRC, cache=file)
+    np.testing.assert_allclose(found.rgb, known.rgb, rtol=1e-3, atol=1e-4)
+    assert found.statistics["steps"] == known.statistics["steps"] == 4
+    assert found.statistics["queries"] == known.statistics["queries"] > 0
