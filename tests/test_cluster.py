@@ -15,13 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
+from typer.testing import CliRunner
 
-from mi_neural.measure import benchmark, budget, cluster, jobs, load
+from mi_neural.cli import app
+from mi_neural.measure import benchmark, budget, changes, cluster, exr, jobs, load, sequence
 from mi_neural.measure.load import InputError
 from mi_neural.measure.moments import Moments
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'mi_neural[cluster]'")
 
+HOST = "127.0.0.1"
 SIZE, SPP = (16, 16), 64
 #: False alarms per statistical test.
 ERROR_RATE = 1e-4
@@ -33,7 +36,7 @@ def scheduler(tmp_path_factory):
     """The address of a scheduler without workers."""
     folder = tmp_path_factory.mktemp("cluster")
     file = folder / "scheduler.json"
-    process = start("scheduler", "--port", "0", "--scheduler-file", file, folder=folder)
+    process = start("scheduler", "--host", HOST, "--port", 0, "--scheduler-file", file, folder=folder)
     deadline = time.monotonic() + 60
     while not file.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -53,7 +56,8 @@ def address(scheduler, tmp_path_factory):
 
 def workers_at(scheduler: str, folder: Path, n: int = 2) -> subprocess.Popen:
     preload = Path(__file__).with_name("quick_kernels.py")
-    return start("worker", scheduler, "--nworkers", n, "--nthreads", 1, "--preload", preload, folder=folder)
+    options = ("--host", HOST, "--nworkers", n, "--nthreads", 1, "--preload", preload)
+    return start("worker", scheduler, *options, folder=folder)
 
 
 def start(kind: str, *arguments, folder: Path) -> subprocess.Popen:
@@ -215,5 +219,126 @@ def test_cache_is_trained_once_and_read_by_the_workers(address, tmp_path):
     case.integrator.save_cache(file)
     found, known = render(NIRC, address, cache=file), render(NIRC, cache=file)
     np.testing.assert_allclose(found.rgb, known.rgb, rtol=1e-3, atol=1e-4)
-    assert found.statistics["steps"] == known.statistics["steps"] == 4
     assert found.statistics["queries"] == known.statistics["queries"] > 0
+
+
+def test_ctrl_c_keeps_the_parts_that_are_done(address):
+    def stop(done: float, total: float) -> None:
+        raise KeyboardInterrupt
+
+    found = render(client=address, progress=stop)
+    assert found.interrupted and 0 < found.spp < SPP and found.rgb.mean() > 0.1
+    assert not render(client=address).interrupted, "and the workers take what comes next"
+
+
+def test_command_renders_on_the_workers_and_keeps_the_variance(address, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["render", "cornell_box", "-i", "path", "--spp", str(SPP), "--size", "16x16", "--json", "a.json"]
+    done = CliRunner().invoke(app, [*command, "-o", "a.exr", "--scheduler", address.removeprefix("tcp://")])
+    assert done.exit_code == 0, done.output
+    image, known = exr.read("a.exr"), render()
+    np.testing.assert_allclose(image.rgb, known.rgb, rtol=1e-5)
+    np.testing.assert_allclose(image.layer("variance"), variance(known), rtol=1e-4)
+    assert json.loads(Path("a.json").read_text())["statistics"]["workers"] == 2
+
+
+@pytest.mark.parametrize("integrator", ["path", NIRC])
+def test_frames_of_two_workers_are_those_of_one_process(address, tmp_path, integrator):
+    """A lamp that dims from frame to frame, and a cache that is trained before the first one only."""
+    texts = ["emitter.radiance.value=value*(1-0.2*frame)"]
+    plan = sequence.Plan(spp=4, seed=3)
+
+    def run(folder: Path, client: str | None) -> list[np.ndarray]:
+        loaded = load.load_scene("cornell_box", SIZE, merge=False)
+        case = benchmark.make_cases(loaded, [load.parse_integrator(integrator)])[0]
+        over_time = sequence.Sequence(loaded.scene, changes.parse(texts, 4, None), 4)
+        with cluster.connect(client) as workers:
+            elsewhere = workers and cluster.frames_of(workers, loaded, SIZE, texts, over_time, plan)
+            [result] = sequence.Run(loaded, over_time, plan, folder, elsewhere=elsewhere).run([case])
+        return [result.image(k).rgb for k in range(4)]
+
+    found, known = run(tmp_path / "cluster", address), run(tmp_path / "here", None)
+    means = [image.mean() for image in known]
+    assert means == sorted(means, reverse=True) and means[-1] < 0.8 * means[0]
+    # Two trainings differ by the order in which records are summed
+    np.testing.assert_allclose(found, known, rtol=1e-5 if integrator == "path" else 0.05, atol=1e-3)
+
+
+# ---------------------------------------------------------------- what goes wrong is one line
+
+
+@dataclass
+class Homeless:
+    """A job whose class the workers cannot import."""
+
+    def run(self):
+        return 1
+
+
+def first_error(address: str, job) -> str:
+    with cluster.connect(address) as workers, pytest.raises(cluster.ClusterError) as error:
+        next(workers.map([job]))
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_error_of_a_worker_comes_back_as_one_line_that_names_it(address):
+    [part] = cluster.plan_parts(setup_of()[0], [1], 1, 0)
+    text = first_error(address, replace(part, setup=replace(part.setup, scene="/nowhere/scene.xml")))
+    assert text.startswith("worker tcp://") and "it sees no file /nowhere/scene.xml" in text
+    assert "a worker cannot import test_cluster" in first_error(address, Homeless())
+
+
+WRONG = {
+    "versions": ({"versions": jobs.versions() | {"mitsuba": "1.0"}}, "it has mitsuba 3.* asks has 1.0: install"),
+    "scene": ({"scene": "/nowhere/a.xml"}, "it sees no file /nowhere/a.xml: put scene, meshes and textures where all"),
+    "digest": ({"digest": "0"}, r"its .*cornell_box.xml is another file than the one here"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_process_that_would_give_another_result_refuses(kind):
+    changed, message = WRONG[kind]
+    with pytest.raises(InputError, match=message):
+        jobs.Part(replace(setup_of()[0], **changed), 0, (1,), 1, 0).run()
+
+
+@pytest.mark.parametrize(
+    "integrator, over_time, message",
+    [
+        ("restir_di", False, "reuses the images before .*: add history=0"),
+        ("nirc_two_level:mode=progressive", False, "mode=progressive"),
+        ("nirc", True, "trains before each frame .*: add train_steps=0"),
+    ],
+)
+def test_what_cannot_be_rendered_in_parts_is_refused(integrator, over_time, message):
+    with pytest.raises(cluster.ClusterError, match=message):
+        cluster.check(setup_of(integrator)[2], over_time)
+
+
+@pytest.mark.parametrize("wrong", ["tcp://127.0.0.1:1", "nonsense", "no://127.0.0.1:1"])
+def test_address_where_no_scheduler_answers(wrong, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(cluster.ClusterError, match=r"no Dask scheduler answers at .*: type `dask scheduler`"):
+        render(client=wrong)
+
+
+def test_dask_that_is_not_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r"pip install 'mi_neural\[cluster\]'"):
+        render(client="tcp://127.0.0.1:1")
+    assert render(spp=4).spp == 4, "needed for nothing else"
+
+
+def test_no_worker_for_a_while():
+
+    class Nobody:
+        status, scheduler = "running", type("", (), {"address": "tcp://HOST:8786"})
+
+        def nthreads(self):
+            return {}
+
+    workers = cluster.Workers(Nobody(), patience=0.1)
+    for wait in (workers.count, lambda: next(workers.map([None]))):
+        with pytest.raises(cluster.ClusterError, match=r"no worker at tcp://HOST:8786 for 0.1 s: start one with"):
+            wait()

@@ -18,6 +18,7 @@ A worker that dies is replaced: Dask hands its job to another, and a worker's na
 
 from __future__ import annotations
 
+import pickle
 import queue
 import socket
 import time
@@ -26,7 +27,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -71,12 +72,16 @@ def _renderer(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "mi_neural", dr.set_thread_count, (threads,))
 
 
-def work(job, *data) -> Answer:
-    """Run a job on the worker that this is called on; what the user can mend comes back as one line."""
+def work(job, packed: bytes | None = None) -> Answer:
+    """Run a job, with the pickled data that comes with it, on the worker that this is called on.
+
+    What the user can mend comes back as one line.
+    """
     from distributed import get_worker
 
     worker = get_worker()
     name = f"{worker.address} ({socket.gethostname()})"
+    data = () if packed is None else (pickle.loads(packed),)
 
     def run() -> Answer:
         return Answer(job.run(*data), worker.address, environment.describe())
@@ -87,8 +92,16 @@ def work(job, *data) -> Answer:
         raise ClusterError(f"worker {name}: {one_line(error)}") from None
 
 
-def _same(data):
-    return data
+def _by_value() -> Callable:
+    """A function that calls what was pickled. Being nested it is sent as code: the scheduler looks into each task, and
+    would import a function of ours, and Mitsuba with it."""
+
+    def call(packed: bytes, *data):
+        import pickle
+
+        return pickle.loads(packed)(*data)
+
+    return call
 
 
 # ------------------------------------------------------------------------------------------------------------------
@@ -162,10 +175,10 @@ class Workers:
         import dask
 
         waiting, running, finished = deque(enumerate(job_list)), {}, queue.SimpleQueue()
-        seen = time.monotonic()
+        seen, call = time.monotonic(), _by_value()
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
             # A task and not scattered data: it is made anew where all workers that held it are gone
-            sent = () if data is None else (self.client.submit(_same, data, pure=False),)
+            sent = () if data is None else (self.client.submit(bytes, pickle.dumps(data), pure=False),)
         try:
             while waiting or running:
                 names = self.names()
@@ -177,8 +190,9 @@ class Workers:
                     if waiting and name not in busy:
                         index, job = waiting.popleft()
                         future = self.client.submit(
-                            work, job, *sent, workers=[name], allow_other_workers=True, pure=False
-                        )
+                            call, pickle.dumps(partial(work, job)), *sent,
+                            workers=[name], allow_other_workers=True, pure=False,
+                        )  # fmt: skip
                         running[future] = index, name
                         future.add_done_callback(finished.put)
                 try:
