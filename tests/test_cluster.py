@@ -5,6 +5,7 @@ The workers compile their kernels as the tests do (`quick_kernels` as Dask's pre
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -31,48 +32,54 @@ ERROR_RATE = 1e-4
 NIRC = "nirc:levels=2,hashmap_size=512,width=16,train_samples=256,train_frames=4,train_steps=0"
 
 
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory):
-    """The address of a scheduler without workers."""
-    folder = tmp_path_factory.mktemp("cluster")
-    file = folder / "scheduler.json"
-    process = start("scheduler", "--host", HOST, "--port", 0, "--scheduler-file", file, folder=folder)
-    deadline = time.monotonic() + 60
-    while not file.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    yield json.loads(file.read_text())["address"]
-    end(process)
+class Local:
+    """A scheduler, and workers of one thread each with a nanny each that starts it anew, as processes of their own."""
+
+    def __init__(self, folder: Path, workers: int = 2) -> None:
+        self.folder, self.processes = folder, {}
+        try:
+            self.start("scheduler", "--port", 0, "--scheduler-file", folder / "scheduler.json")
+            self.address = self.wait_for_address(folder / "scheduler.json")
+            preload = Path(__file__).with_name("quick_kernels.py")
+            self.start("worker", self.address, "--nworkers", workers, "--nthreads", 1, "--preload", preload)
+            with distributed.Client(self.address, set_as_default=False) as client:
+                client.wait_for_workers(workers, timeout=60)
+        except BaseException:
+            self.end()
+            raise
+
+    @staticmethod
+    def wait_for_address(file: Path) -> str:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            try:
+                return json.loads(file.read_text())["address"]
+            except (OSError, ValueError):  # not there, or not all of it
+                time.sleep(0.05)
+        raise TimeoutError("the scheduler does not start")
+
+    def start(self, kind: str, *arguments) -> None:
+        module = f"distributed.cli.dask_{kind}"
+        command = [sys.executable, "-m", module, *map(str, arguments), "--host", HOST, "--no-dashboard"]
+        with open(self.folder / f"{kind}.log", "w") as log:
+            self.processes[kind] = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log)
+
+    def end(self) -> None:
+        for process in reversed(self.processes.values()):
+            process.terminate()
+            try:
+                process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 @pytest.fixture(scope="module")
-def address(scheduler, tmp_path_factory):
-    """The same scheduler with two workers of one thread each, and a nanny each that starts it anew."""
-    process = workers_at(scheduler, tmp_path_factory.mktemp("workers"))
-    with distributed.Client(scheduler, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=60)
-    yield scheduler
-    end(process)
-
-
-def workers_at(scheduler: str, folder: Path, n: int = 2) -> subprocess.Popen:
-    preload = Path(__file__).with_name("quick_kernels.py")
-    options = ("--host", HOST, "--nworkers", n, "--nthreads", 1, "--preload", preload)
-    return start("worker", scheduler, *options, folder=folder)
-
-
-def start(kind: str, *arguments, folder: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *map(str, arguments), "--no-dashboard"]
-    with open(folder / f"{kind}.log", "w") as log:
-        return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
-
-
-def end(process: subprocess.Popen) -> None:
-    process.terminate()
-    try:
-        process.wait(timeout=10)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+def address(tmp_path_factory):
+    """The address of a cluster with two workers."""
+    local = Local(tmp_path_factory.mktemp("cluster"))
+    yield local.address
+    local.end()
 
 
 def pids(address: str) -> dict[str, int]:
@@ -180,24 +187,26 @@ def test_passes_are_those_of_one_process_where_it_has_many(monkeypatch):
 # ---------------------------------------------------------------- two workers
 
 
-def test_image_of_two_workers_is_that_of_one_process_although_one_is_killed(address):
+@pytest.mark.parametrize("n", [1, 2])
+def test_image_of_two_workers_is_that_of_one_process_although_some_are_killed(address, n):
     """The same passes with the same numbers: equal up to the order of summation."""
     before, victims = pids(address), []
 
     def kill(done: float, total: float) -> None:
         if not victims:
-            victims.append(next(iter(before.values())))
-            os.kill(victims[0], signal.SIGKILL)
+            victims.extend(list(before.values())[:n])
+            for pid in victims:
+                os.kill(pid, signal.SIGKILL)
 
     found, known = render(client=address, progress=kill), render()
-    assert victims and found.spp == SPP and not found.interrupted
+    assert len(victims) == n and found.spp == SPP and not found.interrupted
     np.testing.assert_allclose(found.rgb, known.rgb, rtol=1e-5)
     np.testing.assert_allclose(variance(found), variance(known), rtol=1e-4)
 
     deadline = time.monotonic() + 30
     while len(after := pids(address)) < 2 and time.monotonic() < deadline:
         time.sleep(0.2)
-    assert len(after) == 2 and victims[0] not in after.values(), "its nanny starts it anew"
+    assert len(after) == 2 and not set(victims) & set(after.values()), "their nannies start them anew"
 
 
 def test_merged_image_and_another_of_one_process_differ_by_their_variances(address):
@@ -342,3 +351,37 @@ def test_no_worker_for_a_while():
     for wait in (workers.count, lambda: next(workers.map([None]))):
         with pytest.raises(cluster.ClusterError, match=r"no worker at tcp://HOST:8786 for 0.1 s: start one with"):
             wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["worker", "scheduler"])
+def test_lost_cluster_leaves_the_image_of_the_parts_that_are_done(tmp_path, lost):
+    local = Local(tmp_path)
+
+    def kill(done: float, total: float) -> None:
+        process = local.processes[lost]
+        if process.poll() is None:
+            process.kill() if lost == "scheduler" else process.terminate()
+            process.wait()
+
+    try:
+        found = render(client=local.address, progress=kill, patience=2.0)
+    finally:
+        local.end()
+    message = {"worker": "no worker at .* for 2 s: start one with", "scheduler": "does not answer any more"}[lost]
+    assert re.search(message, found.problem), found.problem
+    assert found.interrupted and 0 < found.spp < SPP and found.rgb.mean() > 0.1
+
+
+@dataclass(frozen=True)
+class Fatal(jobs.Part):
+    """A job that ends its worker, as one does that needs more memory than there is."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+@pytest.mark.slow
+def test_job_that_ends_every_worker_is_given_up(address):
+    fatal = Fatal(setup_of()[0], 0, (1,), 1, 0)
+    assert "a job lost 4 workers, one after the other" in first_error(address, fatal)

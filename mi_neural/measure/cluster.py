@@ -12,8 +12,8 @@ with the same random numbers, and merged by sample count (:class:`~mi_neural.mea
 of one process up to the order of summation, except for what a worker measures or learns by itself (a light sampler's
 visibility, the pilot of `nirc_two_level`), which changes noise and no mean.
 
-A worker that dies is replaced: Dask hands its job to another, and a worker's nanny starts it anew. Needs the extra
-`cluster` (`distributed`).
+A worker that dies is replaced: its job goes to another, and its nanny (Dask's) starts it anew. Needs the extra
+`cluster` (`distributed`); the scheduler itself needs nothing of this package.
 """
 
 from __future__ import annotations
@@ -43,8 +43,10 @@ LEAST_PASSES = 16
 PARTS_PER_WORKER = 8
 #: Seconds to wait for the scheduler's answer, and for a worker where there is none (any more).
 CONNECT_SECONDS, PATIENCE = 10.0, 60.0
-#: Seconds between two looks at who is there.
-LOOK_SECONDS = 1.0
+#: Seconds between two looks at who is there, and that an answer may take to be sent.
+LOOK_SECONDS, FETCH_SECONDS = 1.0, 300.0
+#: Workers that a job may lose before it is taken to be the reason.
+LOSSES = 3
 
 
 class ClusterError(InputError):
@@ -168,55 +170,77 @@ class Workers:
     def map(self, job_list: list, data: object = None) -> Iterator[tuple[int, Answer]]:
         """Run jobs, each with `data` (sent once); yields (index, answer) as they are done, in any order.
 
-        A job whose worker dies is run by another. Whoever stops listening, by an exception or otherwise, cancels what
+        A job whose worker dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what
         has not begun. Raises :class:`ClusterError`: a job failed, took several workers with it, no worker or no
         scheduler is there any more.
         """
         import dask
 
-        waiting, running, finished = deque(enumerate(job_list)), {}, queue.SimpleQueue()
-        seen, call = time.monotonic(), _by_value()
+        waiting, finished, call = deque(enumerate(job_list)), queue.SimpleQueue(), _by_value()
+        running: dict[object, tuple[int, str]] = {}  # future -> job, worker
+        losses: Counter[int] = Counter()
+        seen = time.monotonic()
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
             # A task and not scattered data: it is made anew where all workers that held it are gone
             sent = () if data is None else (self.client.submit(bytes, pickle.dumps(data), pure=False),)
+
+        def hand_out(names: list[str]) -> None:
+            busy = {name for _, name in running.values()}
+            for name in names:
+                if waiting and name not in busy:
+                    index, _ = waiting[0]
+                    packed = pickle.dumps(partial(work, waiting.popleft()[1]))
+                    future = self.client.submit(call, packed, *sent, workers=[name], pure=False)
+                    running[future] = index, name
+                    future.add_done_callback(finished.put)
+
+        def lost(index: int, name: str) -> None:
+            # Not left to Dask: with workers to choose from it may put two jobs on one, told which one it waits for that
+            losses[index] += 1
+            if losses[index] > LOSSES:
+                raise ClusterError(
+                    f"a job lost {losses[index]} workers, one after the other, the last at {name}: look at their logs; "
+                    "if memory was too small, start them with a larger --memory-limit"
+                )
+            waiting.appendleft((index, job_list[index]))
+
         try:
             while waiting or running:
                 names = self.names()
-                if names:
-                    seen = time.monotonic()
+                seen = time.monotonic() if names else seen
                 self._still_hope(seen)
-                busy = {name for _, name in running.values()}
-                for name in names:
-                    if waiting and name not in busy:
-                        index, job = waiting.popleft()
-                        future = self.client.submit(
-                            call, pickle.dumps(partial(work, job)), *sent,
-                            workers=[name], allow_other_workers=True, pure=False,
-                        )  # fmt: skip
-                        running[future] = index, name
-                        future.add_done_callback(finished.put)
+                for future, (index, name) in list(running.items()):
+                    if name not in names:
+                        del running[future]
+                        future.cancel()
+                        lost(index, name)
+                hand_out(names)
                 try:
                     future = finished.get(timeout=LOOK_SECONDS)
                 except queue.Empty:
                     continue
-                index, _ = running.pop(future)
-                yield index, self._result(future)
+                if future in running:  # else it was given to another worker
+                    index, name = running.pop(future)
+                    hand_out(names)  # the worker goes on while its answer is fetched
+                    if (answer := self._fetch(future)) is None:
+                        lost(index, name)
+                    else:
+                        yield index, answer
         finally:
             if running and self.client.status == "running":
                 self.client.cancel(list(running), force=True)
 
-    def _result(self, future) -> Answer:
+    def _fetch(self, future) -> Answer | None:
+        """The answer of a job that is done; None where its worker has died since."""
         distributed = _distributed()
+        if not future.done():
+            return None
         try:
-            return future.result()
+            return future.result(timeout=FETCH_SECONDS)
         except ClusterError:
             raise
-        except distributed.KilledWorker as error:
-            raise ClusterError(
-                f"a job ended {1 + error.allowed_failures} workers, one after the other, the last at "
-                f"{error.last_worker.address}: look at its log; if its memory was too small, start the workers with a "
-                "larger --memory-limit"
-            ) from None
+        except (distributed.TimeoutError, distributed.KilledWorker):
+            return None
         except ModuleNotFoundError as error:
             raise ClusterError(
                 f"a worker cannot import {error.name}: in its environment type pip install 'mi_neural[cluster]'"
