@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/mi_neural.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture test stress lint clean
+.PHONY: help demo picture bench test stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -30,6 +30,12 @@ demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EX
 picture: demo  ## the README's picture, of the demo's frames
 	$(BIN)/python -m mi_neural.measure.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
 	    out/demo/path_$(k) out/demo/nirc_$(k))
+
+BENCH := -i path -i nirc -i nrc -i nirc:termination=auto -i nirc_two_level --seconds 1 --steady 64 --frame-seconds 0.25 \
+    --repeats 3 --denoise
+
+bench: $(STAMP)  ## integrators on our own scenes: tables and report in out/bench; under 20 minutes on two cores, goes on where stopped
+	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 192x108,144x144 --reference-spp 1024 -o out/bench
 
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(STAMP)  ## the default tests, a few minutes on two cores

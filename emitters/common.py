@@ -34,6 +34,10 @@ class LightSampler(mi.Emitter):
     def reset(self) -> None:
         """Forget what was learned. The table of lights is kept."""
 
+    def reseed(self, seed: int) -> None:
+        """As :meth:`reset`, and learn by the random numbers of another `seed` from now on."""
+        self.reset()
+
     # -------------------------------------------------------------------------------------------------------------
     # To be given by the plugin
 

@@ -110,6 +110,10 @@ class NVCLightSampler(LightSampler):
         if self.sampler is not None:
             self.sampler.field = None
 
+    def reseed(self, seed: int) -> None:
+        self.cache.seed = seed
+        self.reset()
+
     def make(self, scene, table):
         try:
             groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed, self.environment_cells)

@@ -259,6 +259,13 @@ class CacheIntegrator(mi.SamplingIntegrator):
         if self.light_sampler is not None:
             self.light_sampler.reset()
 
+    def reseed(self, seed: int) -> None:
+        """As :meth:`reset`, and learn by the random numbers of another `seed` from now on."""
+        self.cache.seed = seed
+        if self.light_sampler is not None:
+            self.light_sampler.reseed(seed)
+        self.reset()
+
     def _ready(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
         known = self.state.watch.parts

@@ -151,6 +151,12 @@ class LightSamplingIntegrator(mi.SamplingIntegrator):
         if self.light_sampler is not None:
             self.light_sampler.reset()
 
+    def reseed(self, seed: int) -> None:
+        """As :meth:`reset`, and learn by the random numbers of another `seed` from now on."""
+        if self.light_sampler is not None:
+            self.light_sampler.reseed(seed)
+        self.reset()
+
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train the light sampler for so many frames. `progress` is called with (done, total). Returns `statistics`."""
         sensor = sensor_of(scene, sensor, self.plugin)

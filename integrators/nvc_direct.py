@@ -164,6 +164,10 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
         self.mixed = self.mirrors = True  # whether materials have mirror lobes beside others, and nothing else
 
+    def reseed(self, seed: int) -> None:
+        self.cache.seed = seed
+        super().reseed(seed)
+
     def statistics(self) -> dict:
         """Facts since the last reset."""
         facts = dict(self.light_sampler.statistics())

@@ -20,6 +20,7 @@ def register() -> None:
             self.interrupt_render = props.get("interrupt_render", -1)  # in the n-th render call from now
             self.interrupt_train = props.get("interrupt_train", False)
             self.nan = props.get("nan", False)  # a NaN in every image
+            self.fail = props.get("fail", False)  # refuse every scene
             self.frames = self.n_renders = self.n_prepared = 0
             self.seconds = 0.0
 
@@ -61,6 +62,8 @@ def register() -> None:
             return self.fraction
 
         def prepare(self, scene, sensor=0, spp=1):
+            if self.fail:
+                raise ValueError("fake_cache: this scene cannot be rendered")
             self.n_prepared += 1
             n, self.n_renders = self.n_renders, -1_000_000  # not counted
             self.render(scene, scene.sensors()[sensor], 1, spp)

@@ -1,14 +1,18 @@
 """Budgets, passes, references and rows, with Mitsuba's `path` and with a cache that is one number."""
 
+import base64
+import csv
 import json
+import os
 import time
+from itertools import pairwise
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from fake_cache import register
 
-from mi_neural.measure import benchmark, budget, denoise, exr, load, reference, report
+from mi_neural.measure import benchmark, budget, denoise, exr, load, page, reference, repeats, report, suite
 
 SIZE = (16, 12)
 #: Keys that results must hold, by the contract of the command line.
@@ -53,7 +57,12 @@ def clock(monkeypatch):
     monkeypatch.setattr(budget, "clock", lambda: now[0])
     monkeypatch.setattr(budget, "render_pass", timed)
     monkeypatch.setattr("fake_cache.sleep", wait)
-    return lambda: now[0]
+
+    def read():
+        return now[0]
+
+    read.wait = wait
+    return read
 
 
 # ---------------------------------------------------------------- passes
@@ -114,6 +123,19 @@ def test_budget_is_met(loaded, path, clock):
     rendered = budget.render_seconds(loaded.scene, path, 0.4)
     assert abs(clock() - 0.4) <= SAMPLE_SECONDS / 2 and rendered.spp == round(0.4 / SAMPLE_SECONDS)
     assert rendered.seconds_render == pytest.approx(clock()) and rendered.seconds_train == 0.0
+
+
+def test_watching_costs_no_time_of_the_budget(loaded, path, clock):
+    seen = []
+
+    def watch(rendered):
+        seen.append(rendered)
+        clock.wait(10.0)
+
+    rendered = budget.render_seconds(loaded.scene, path, 0.4, watch=watch)
+    assert rendered.spp == round(0.4 / SAMPLE_SECONDS) and seen[0].spp == 1
+    assert all(2 * a.spp <= b.spp for a, b in pairwise(seen)) and seen[-1].spp > rendered.spp / 2
+    assert all(s.seconds_render == pytest.approx(s.spp * SAMPLE_SECONDS) for s in seen)
 
 
 def test_budget_is_met_by_the_clock_on_the_wall(loaded, path):
@@ -195,6 +217,35 @@ def test_keys_are_typed():
     assert spec.label == "nirc:a=8,b=0.5,c=true,d=text,e.f=0.001"
 
 
+def test_size_nearest_in_shape_is_taken():
+    sizes = [(32, 18), (20, 20)]
+    assert load.load_scene("cornell_box", sizes).size == (20, 20)
+    assert load.load_scene("ajar_door", sizes).size == (32, 18)
+
+
+def test_digest_follows_what_a_scene_includes_and_names(tmp_path):
+    def digest() -> str:
+        return load.load_scene(str(tmp_path / "scene.xml"), (8, 8)).digest
+
+    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"> <include filename="part.xml"/>
+        <sensor type="perspective"/> <emitter type="constant"/> </scene>""")
+    part = """<scene version="3.0.0"> <shape type="ply"> <string name="filename" value="m.ply"/> </shape> {} </scene>"""
+    (tmp_path / "part.xml").write_text(part.format(""))
+    ply = mi.Mesh("m", 3, 1)
+    params = mi.traverse(ply)
+    params["vertex_positions"], params["faces"] = [0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]
+    params.update()
+    ply.write_ply(str(tmp_path / "m.ply"))
+    before = digest()
+    assert before == digest()
+    (tmp_path / "part.xml").write_text(part.format("<!-- another -->"))
+    included = digest()
+    params["vertex_positions"] = [0, 0, 0, 2, 0, 0, 0, 1, 0]
+    params.update()
+    ply.write_ply(str(tmp_path / "m.ply"))
+    assert len({before, included, digest()}) == 3
+
+
 def test_depth_is_carried_where_it_is_known():
     carried = {"max_depth": 5, "hide_emitters": True}
     _, keys = load.build_integrator(load.IntegratorSpec("path", {"max_depth": 3}), carried)
@@ -241,6 +292,29 @@ def test_interrupted_reference_keeps_its_passes(loaded, tmp_path):
         reference.render_reference(loaded, 8 * size, tmp_path, stop)
     kept = reference.load_reference(reference.reference_path(loaded, tmp_path))
     assert int(kept.metadata["spp"]) == 3 * size
+
+
+def test_reference_beside_a_scene_is_found(tmp_path):
+    for name in ("reference_8x4.exr", "sun_reference_8x4.exr"):
+        exr.write(tmp_path / name, np.ones((4, 8, 3)))
+    assert reference.beside(tmp_path / "scene.xml", (8, 4)) == tmp_path / "reference_8x4.exr"
+    assert reference.beside(tmp_path / "sun.xml", (8, 4)) == tmp_path / "sun_reference_8x4.exr"
+    assert reference.beside(tmp_path / "moon.xml", (8, 4)) is reference.beside(tmp_path / "sun.xml", (4, 8)) is None
+
+
+def test_references_have_a_place_in_the_users_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert reference.cache_folder() == tmp_path / "mi_neural" / "references"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    if os.name != "nt":
+        assert reference.cache_folder() == tmp_path / "home" / ".cache" / "mi_neural" / "references"
+
+
+def test_standard_error_of_a_reference_is_relative():
+    known = reference.Reference(np.full((4, 4, 3), 2.0), np.full((4, 4, 3), 0.04), {}, None)
+    assert known.standard_error() == pytest.approx(0.1, rel=0.01)  # 0.2 of 2
+    assert reference.Reference(known.rgb, None, {}, None).standard_error() is None
 
 
 def test_unusable_references_are_refused(tmp_path):
@@ -297,13 +371,15 @@ def test_rows_hold_what_the_contract_names(measured):
         facts = json.loads(json.dumps(row.to_json(), allow_nan=False))
         assert set(KEYS) <= facts.keys()
         assert facts["parameters"]["max_depth"] == 4
-        assert row.relmse > 0.0 and row.flip > 0.0 and row.environment == {"cores": 1}
+        assert row.mode in benchmark.WITHOUT_PICTURE or (row.relmse > 0.0 and row.flip > 0.0)
+        assert row.environment == {"cores": 1}
         assert row.seconds_total == row.seconds_train + row.seconds_render + row.seconds_denoise
     variants = 2 if has_denoiser() else 1
-    modes = [row.mode for row in rows if row.label == "path"]
+    pictured = [row for row in rows if row.mode not in benchmark.WITHOUT_PICTURE]
+    modes = [row.mode for row in pictured if row.label == "path"]
     assert modes == ["one-shot"] * 2 * variants + ["sample"] * variants + ["steady"] * variants
 
-    cached = [row for row in rows if row.integrator == "fake_cache"]
+    cached = [row for row in pictured if row.integrator == "fake_cache"]
     assert 0.25 * 0.05 <= cached[0].seconds_train < 0.1
     steady = next(row for row in cached if row.mode == "steady")
     assert steady.pretrain_frames == 3 and steady.frames == benchmark.STEADY_FRAMES and steady.seconds_train == 0.0
@@ -311,25 +387,56 @@ def test_rows_hold_what_the_contract_names(measured):
     assert steady.records == 3, "one-shot runs before it must leave nothing in the cache"
 
 
+def test_curve_is_that_of_the_longest_run_and_ends_with_it(measured):
+    rows = [p.row for p in measured[0] if p.row.label == "path" and not p.row.denoised]
+    curve = [row for row in rows if row.mode == "curve"]
+    (final,) = (row for row in rows if row.mode == "one-shot" and row.budget_seconds == 0.1)
+    assert {row.budget_seconds for row in curve} == {0.1}
+    assert all(b.spp >= 2 * a.spp and b.seconds_total > a.seconds_total for a, b in pairwise(curve))
+    assert curve[0].spp == 1 and curve[-1].spp <= final.spp < 2 * curve[-1].spp
+    assert curve[0].relmse_trimmed > curve[-1].relmse_trimmed and curve[-1].seconds_total <= final.seconds_total
+
+
+def test_time_of_a_frame_is_split_and_memory_counted(measured):
+    rows = [p.row for p in measured[0]]
+    split = [row for row in rows if row.mode == "split"]
+    assert [row.integrator for row in split] == ["path", "fake_cache"] and split[0].split["trace"] > 0
+    assert all(row.split is None for row in rows if row.mode != "split")
+    if rows[0].peak_mib is not None:
+        assert all(50 < row.peak_mib < 20_000 for row in rows)
+
+
 def test_ns_per_sample_is_time_over_samples(measured):
-    row = measured[0][0].row
+    row = next(p.row for p in measured[0] if p.row.mode == "one-shot")
     assert row.ns_per_sample == pytest.approx(1e9 * row.seconds_render / (SIZE[0] * SIZE[1] * row.spp))
 
 
 def test_report_is_one_file_that_loads_nothing(measured, tmp_path):
     pictures, ref = measured
     rows = [p.row for p in pictures]
-    found = report.Report("a<b", SIZE, "mi-neural compare", {"cores": 1}, rows, pictures, ref, ["a & b"])
-    report.write(found, tmp_path)
-    page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") >= 2 * len(pictures) + 1
-    assert "a&lt;b" in page and "a &amp; b" in page and page.count("<svg") == 2
+    entries = [page.reference_entry(ref, 0.0), *(page.entry(p, 0.0) for p in pictures if p.rgb is not None)]
+    scene = report.SceneResult("a<b", SIZE, rows, repeats.group(rows), ref.facts(), ["a & b"], entries)
+    suite.write(report.Report("mi-neural compare", {"cores": 1}, [scene], ["c & d"]), tmp_path)
+    text = (tmp_path / "report.html").read_text()
+    assert text.count("data:image/png;base64,") == 2 * len(entries) - 1
+    assert all(part in text for part in ("a&lt;b", "a &amp; b", "c &amp; d", "class Viewer", ".viewer {"))
+    assert text.count("<svg") == 3 == len(list(tmp_path.glob("curves_*.svg")))
     for outside in ('src="http', "url(http", "<link", "@import", "fetch("):
-        assert outside not in page
+        assert outside not in text
     results = json.loads((tmp_path / "results.json").read_text())
-    assert len(results["rows"]) == len(rows) and results["reference"]["variance_subtracted"] is True
-    table = (tmp_path / "table.md").read_text().splitlines()
-    assert len(table) == len(rows) + 2 and len({line.count("|") for line in table}) == 1
+    assert len(results["rows"]) == len(rows) and results["scenes"][0]["reference"]["variance_subtracted"] is True
+    lines = (tmp_path / "results.csv").read_text().splitlines()
+    assert len(lines) == len(rows) + 1 and len({len(row) for row in csv.reader(lines)}) == 1
+    first, second = (tmp_path / "table.md").read_text().split("\n\n")
+    assert len(first.splitlines()) == len(scene.groups) - 2 + 2  # two lines are in the second table: splits of frames
+    assert len({line.count("|") for line in first.splitlines()}) == 1 and "python" in second
+
+
+def test_pictures_of_large_pages_are_jpeg(measured):
+    picture = next(p for p in measured[0] if p.rgb is not None)
+    exact, small = page.entry(picture, 0.0), page.entry(picture, 0.0, exact=False)
+    assert exact["image"].startswith("data:image/png") and small["image"].startswith("data:image/jpeg")
+    assert base64.b64decode(small["error"].partition(",")[2])[:3] == b"\xff\xd8\xff"
 
 
 def test_a_key_that_no_integrator_knows_is_refused(loaded):

@@ -158,24 +158,26 @@ def test_compare_writes_report_table_and_images():
         "--seconds",
         "0.05,0.1",
     ]
-    arguments += ["--steady", 2, "--frame-seconds", 0.05, "--reference-spp", 64, "-o", "out"]
+    arguments += ["--steady", 2, "--frame-seconds", 0.05, "--reference-spp", 64, "--reference-cache", "references"]
+    arguments += ["-o", "out"]
     result = run(*arguments, *(["--denoise"] if has_denoiser() else []))
     assert "fake_cache:fraction=0.1" in result.output and "report.html" in result.output
     results = facts_of("out/results.json")
-    for row in results["rows"]:
+    assert {row["mode"] for row in results["rows"]} == {"one-shot", "sample", "steady", "split", "curve"}
+    rows = [row for row in results["rows"] if row["mode"] not in ("split", "curve")]
+    for row in rows:
         assert set(KEYS) <= row.keys()
         image = exr.read(os.path.join("out", row["image"]))
         assert image.metadata["label"] == row["label"]
         assert os.path.exists(os.path.join("out", row["image"].replace(".exr", ".png")))
-    assert {row["mode"] for row in results["rows"]} == {"one-shot", "sample", "steady"}
-    assert len({row["image"] for row in results["rows"]}) == len(results["rows"])
+    assert len({row["image"] for row in rows}) == len(rows)
     assert "</html>" in Path("out/report.html").read_text() and "fake_cache" in Path("out/table.md").read_text()
 
 
 def test_interrupted_compare_reports_what_is_done():
     run("compare", "cornell_box", *SMALL, "-i", "path", "-i", "fake_cache:interrupt_render=2,fraction=0", "--seconds",
-        "0.05", "--reference-spp", 32, "-o", "out", code=130)  # fmt: skip
-    rows = facts_of("out/results.json")["rows"]
+        "0.05", "--reference-spp", 32, "--reference-cache", "references", "-o", "out", code=130)  # fmt: skip
+    rows = [row for row in facts_of("out/results.json")["rows"] if row["mode"] != "curve"]
     assert [row["label"].split(":")[0] for row in rows] == ["path", "fake_cache"]
     assert rows[1]["interrupted"] is True and "Interrupted" in Path("out/report.html").read_text()
 
@@ -236,6 +238,13 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*COMPARE, "-o", "out", "--frame-seconds", "1"), "needs --steady"),
         ((*COMPARE, "-o", "out", "--set", "zork=1"), "none of path has a key 'zork'"),
         ((*COMPARE, "-o", "out", "--reference", "a", "--reference-spp", "4"), "exclude each other"),
+        ((*COMPARE, "-o", "out", "--repeats", "0"), "--repeats must be greater than 0"),
+        ((*COMPARE, "lit_cube", "-o", "out", "--reference", "a"), "belongs to one scene, not to 2"),
+        ((*COMPARE, "lit_cube", "-o", "out", "-D", "zork=1"), "none of the scenes has a parameter zork"),
+        (("compare", "-o", "out"), "no scene: give names or files, or --scenes DIR"),
+        (("compare", "--scenes", "nowhere", "-o", "out"), "no folder nowhere"),
+        (("compare", "--scenes", ".", "-o", "out"), "no scene files in"),
+        ((*COMPARE[:2], "--size", "16x12,3", "-o", "out"), "--size takes WIDTHxHEIGHT"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message):

@@ -286,7 +286,7 @@ class Homeless:
 
 def first_error(address: str, job) -> str:
     with cluster.connect(address) as workers, pytest.raises(cluster.ClusterError) as error:
-        next(workers.map([job]))
+        next(workers.run([(job, None)]))
     assert "\n" not in str(error.value)
     return str(error.value)
 
@@ -301,7 +301,7 @@ def test_error_of_a_worker_comes_back_as_one_line_that_names_it(address):
 WRONG = {
     "versions": ({"versions": jobs.versions() | {"mitsuba": "1.0"}}, "it has mitsuba 3.* asks has 1.0: install"),
     "scene": ({"scene": "/nowhere/a.xml"}, "it sees no file /nowhere/a.xml: put scene, meshes and textures where all"),
-    "digest": ({"digest": "0"}, r"its .*cornell_box.xml is another file than the one here"),
+    "digest": ({"digest": "0"}, r"its .*cornell_box.xml, or a file that it names, is not the one here"),
 }
 
 
@@ -348,7 +348,7 @@ def test_no_worker_for_a_while():
             return {}
 
     workers = cluster.Workers(Nobody(), patience=0.1)
-    for wait in (workers.count, lambda: next(workers.map([None]))):
+    for wait in (workers.count, lambda: next(workers.map([(None, None)]))):
         with pytest.raises(cluster.ClusterError, match=r"no worker at tcp://HOST:8786 for 0.1 s: start one with"):
             wait()
 

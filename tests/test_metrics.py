@@ -132,3 +132,34 @@ def test_fixed_exposures_are_kept(rng):
 def test_one_pixel():
     found, _ = metrics.errors(np.ones((1, 1, 3)), np.full((1, 1, 3), 2.0))
     assert found.relmse == found.relmse_trimmed == pytest.approx(0.25 / 1.01)
+
+
+# ---------------------------------------------------------------- bias and variance
+
+
+@pytest.mark.parametrize("n", [2, 5])
+@pytest.mark.parametrize("bias", [0.0, 0.3])
+def test_squared_bias_is_found_in_noise_above_it(rng, bias, n):
+    """Noise of 1 in each image and 0.1 in the reference, at radiance 1: 4 standard errors, one failure in 16,000."""
+    shape = (200, 200, 3)
+    images = [1 + bias + rng.standard_normal(shape) for _ in range(n)]
+    known = (1 + 0.1 * rng.standard_normal(shape)).astype(np.float32)
+    found, spread = metrics.bias_and_variance(images, known, np.full(shape, 0.01, np.float32))
+    pairs = n * (n - 1) / 2
+    assert found == pytest.approx(bias**2, abs=4 * 1.1 / np.sqrt(pairs * images[0].size) + 4 * 0.3 / 346)
+    assert spread == pytest.approx(1, rel=0.05)  # the largest values are left out
+
+
+def test_bias_and_variance_add_up_to_the_error(rng):
+    images = [1 + 0.2 * rng.standard_normal((16, 16, 3)) for _ in range(4)]
+    bias, variance = metrics.bias_and_variance(images, grey(1.0, 16, 16))
+    values = np.sort(np.mean([metrics.relative_squared_errors(i, grey(1.0, 16, 16))[0] for i in images], 0).ravel())
+    assert bias + variance == pytest.approx(values[: len(values) - 1].mean())
+    with pytest.raises(ValueError, match="two images or more, got 1"):
+        metrics.bias_and_variance(images[:1], grey(1.0, 16, 16))
+
+
+def test_equal_images_have_no_variance_and_their_error_is_bias(rng):
+    image = 1 + 0.1 * rng.standard_normal((32, 32, 3))
+    bias, variance = metrics.bias_and_variance([image, image], grey(1.0, 32, 32))
+    assert bias == pytest.approx(metrics.relmse_trimmed(image, grey(1.0, 32, 32))) and abs(variance) < 1e-12

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, budget, cluster, denoise, environment, exr, jobs, load, terminal
+from mi_neural.measure import benchmark, budget, cluster, denoise, environment, exr, jobs, load, repeats, terminal
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
@@ -133,7 +133,7 @@ def render(
             )
         elif workers is not None:
             setup = jobs.Setup.of(loaded, case, wanted_size, own=spec is None)
-            bar = bars(f"rendering {n} samples a pixel on {workers.count()} workers")
+            bar = bars(f"rendering {n} samples a pixel on {terminal.counted(workers.count(), 'worker')}")
             rendered = cluster.render_samples(setup, loaded, case, n, seed, workers, progress=bar, keep=keep)
         else:
             rendered = budget.render_samples(
@@ -153,7 +153,7 @@ def render(
         exr.write_text(json_, json.dumps(row.to_json(), indent=1) + "\n")
     if save_cache is not None:
         case.integrator.save_cache(str(save_cache))
-    terminal.print_rows([row])
+    terminal.print_rows(repeats.group([row]))
     terminal.out.print(f"wrote {output}", soft_wrap=True, markup=False)
     if rendered.problem:
         raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {n} samples a pixel")

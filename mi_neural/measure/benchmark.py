@@ -1,12 +1,18 @@
 """Speed against error: several integrators, equal time, one reference.
 
-Three kinds of rows, each raw and, if asked, denoised:
+Kinds of rows, each raw and, if asked, denoised:
 
 one-shot   a cache starts from nothing; S seconds from the moment kernels are compiled, training included. The
            denoiser's time is reported apart and not part of S.
 steady     a cache has been trained for a number of frames before the clock starts; then frames of equal total time. For
            a denoised frame the denoiser's time is part of it, so that fewer samples are taken.
 sample     frames of one sample a pixel, in the same steady state: median time and mean error.
+split      where the time of such a frame goes (:mod:`.split`).
+curve      the image of the longest one-shot run after 1, 2, 4, ... samples a pixel, as it stood then: relMSE alone,
+           since FLIP takes longer than many a sample.
+
+All of it is repeated with seeds that share nothing, for the training as well, so that the rows of one kind are
+independent. The peak of memory is that of the process since its integrator was compiled.
 
 Errors of steady and sample rows are means over their frames; flicker is the mean SMAPE between consecutive frames of a
 still scene, whose exact value is 0. Every integrator gets the scene's own depth, the same film, the same guides for the
@@ -17,12 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from itertools import pairwise
 from statistics import median
 
 import numpy as np
 
-from . import budget, denoise, metrics
+from . import budget, denoise, memory, metrics, split
 from .budget import Rendered
 from .load import IntegratorSpec, LoadedScene, build_integrator, format_value
 from .reference import Reference
@@ -30,6 +37,10 @@ from .reference import Reference
 #: Frames that a steady row averages over, and those of a sample row.
 STEADY_FRAMES = 4
 SAMPLE_FRAMES = 5
+#: Kinds of rows that are numbers alone.
+WITHOUT_PICTURE = ("curve", "split")
+#: Between the seeds of repeats; frames of one repeat count on from its own.
+SEED_STEP = 10_000
 
 
 @dataclass
@@ -37,7 +48,7 @@ class Row:
     """One line of a table: what was rendered, what it cost, what it is worth. Times in seconds, of one frame.
 
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
-    of an integrator without a cache.
+    of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind.
     """
 
     scene: str
@@ -47,13 +58,10 @@ class Row:
     size: list[int]
     seed: int
     mode: str
-    budget_seconds: float | None
     frames: int
-    pretrain_frames: int
     denoised: bool
     spp: float
     seconds_compile: float
-    seconds_pretrain: float
     seconds_train: float
     seconds_render: float
     seconds_denoise: float
@@ -64,10 +72,16 @@ class Row:
     queries: int | None
     mean: float
     nonfinite: int
+    budget_seconds: float | None = None
+    pretrain_frames: int = 0
+    seconds_pretrain: float = 0.0
     relmse: float | None = None
     relmse_trimmed: float | None = None
     flip: float | None = None
     flicker: float | None = None
+    repeat: int = 0
+    peak_mib: float | None = None
+    split: dict[str, float | None] | None = None
     interrupted: bool = False
     image: str | None = None
     statistics: dict[str, object] = field(default_factory=dict)
@@ -82,12 +96,12 @@ class Row:
 class Picture:
     """An image that belongs to a row, with the FLIP map against the reference where there is one.
 
-    `rendered` is None for one that an earlier run has measured.
+    `rendered` is None for one that an earlier run has measured, `rgb` for rows WITHOUT_PICTURE.
     """
 
     row: Row
     rendered: Rendered | None
-    rgb: np.ndarray
+    rgb: np.ndarray | None
     flip_map: np.ndarray | None
 
 
@@ -109,6 +123,7 @@ class Plan:
     steady_frames: int = 0
     frame_seconds: list[float] = field(default_factory=list)
     seed: int = 0
+    repeats: int = 1
 
 
 class Bench:
@@ -133,21 +148,13 @@ class Bench:
         self._progress = progress or (lambda text: None)
         self.exposures = metrics.flip_exposures(reference.rgb) if reference else None
         self.denoise_seconds = denoise.warm_up(guides) if guides else 0.0
+        self.counts_memory = False
 
     def run(self, cases: list[Case], plan: Plan) -> None:
-        """Measure all cases: one-shot by budgets, then steady and sample rows."""
-        kinds = [False, True] if self.guides else [False]
+        """Measure all cases: one-shot by budgets, then steady and sample rows, and the whole again for each repeat."""
         for case in cases:
-            label, compiled = case.spec.label, False
-            parts = [
-                ([(label, "one-shot", s, d) for d in kinds], lambda s=s, case=case: self.one_shot(case, s, plan.seed))
-                for s in plan.seconds
-            ]
-            if plan.steady_frames:
-                keys = [(label, "sample", None, d) for d in kinds]
-                keys += [(label, "steady", s, d) for s in plan.frame_seconds for d in kinds]
-                parts.append((keys, lambda case=case: self.steady(case, plan)))
-            for keys, measure in parts:
+            compiled = False
+            for keys, measure in self._parts(case, plan):
                 if self.kept is not None and (found := self.kept.pictures(keys, self.reference, self.exposures)):
                     for picture in found:
                         self.on_picture(picture)
@@ -156,73 +163,111 @@ class Bench:
                     self.compile(case, plan.seed)
                     compiled = True
                 measure()
+            case.integrator = None  # what it holds shall not count as the next one's memory
+
+    def recall(self, case: Case, plan: Plan) -> bool:
+        """Hand over all rows of a case if none is left to be measured; returns whether that is so."""
+        found = [self.kept.pictures(keys, self.reference, self.exposures) for keys, _ in self._parts(case, plan)]
+        if not all(found):
+            return False
+        for picture in (picture for pictures in found for picture in pictures):
+            self.on_picture(picture)
+        return True
+
+    def _parts(self, case: Case, plan: Plan) -> list[tuple[list[tuple], Callable[[], None]]]:
+        """What is measured of a case, in pieces: the keys of the rows that a piece gives, and the call that does it."""
+        label, kinds = case.spec.label, [False, True] if self.guides else [False]
+        parts = []
+        for repeat in range(plan.repeats):
+            for seconds in plan.seconds:
+                keys = [(label, "one-shot", seconds, d, repeat) for d in kinds]
+                parts.append((keys, partial(self.one_shot, case, seconds, plan, repeat)))
+            if plan.steady_frames:
+                keys = [(label, "sample", None, d, repeat) for d in kinds]
+                keys += [(label, "steady", s, d, repeat) for s in plan.frame_seconds for d in kinds]
+                keys.append((label, "split", None, False, repeat))
+                parts.append((keys, partial(self.steady, case, plan, repeat)))
+        return parts
 
     # ----------------------------------------------------------------------------------------------------------------
 
     def compile(self, case: Case, seed: int) -> None:
-        """Compile the kernels of all pass sizes."""
+        """Compile the kernels of all pass sizes. The peak of memory counts from here on."""
         self._progress(f"{case.spec.label}: compiling")
+        self.counts_memory = memory.start()
         scene = self.loaded.scene
         case.seconds_compile = budget.warm_up(scene, case.integrator, budget.pass_sizes(scene), seed)
 
-    def one_shot(self, case: Case, seconds: float, seed: int) -> None:
-        """From an empty cache to an image in `seconds`."""
-        budget.reset(case.integrator)
-        progress = self._progress(f"{case.spec.label}: {seconds:g} s")
-        rendered = budget.render_seconds(self.loaded.scene, case.integrator, seconds, seed, progress=progress)
-        self._rows(case, "one-shot", [rendered], seed, budget_seconds=seconds)
+    def one_shot(self, case: Case, seconds: float, plan: Plan, repeat: int) -> None:
+        """From an empty cache to an image in `seconds`; of the longest also how the error fell."""
+        seed = self._begin(case, plan, repeat)
+        progress = self._progress(f"{_name(case, plan, repeat)}: {seconds:g} s")
+        stages: list[Rendered] = []
+        rendered = budget.render_seconds(
+            self.loaded.scene, case.integrator, seconds, seed, progress=progress,
+            watch=stages.append if seconds == max(plan.seconds) else None,
+        )  # fmt: skip
+        facts = {"seed": seed, "repeat": repeat, "budget_seconds": seconds}
+        if self.reference is not None and not rendered.interrupted:
+            for stage in stages:
+                self._rows(case, "curve", [stage], **facts)
+        self._rows(case, "one-shot", [rendered], **facts)
 
-    def steady(self, case: Case, plan: Plan) -> None:
+    def steady(self, case: Case, plan: Plan, repeat: int) -> None:
         """Frames of a cache that has been trained before the clock starts."""
         scene, integrator = self.loaded.scene, case.integrator
-        budget.reset(integrator)
-        facts = {}
+        seed, name = self._begin(case, plan, repeat), _name(case, plan, repeat)
+        facts: dict[str, object] = {"seed": seed, "repeat": repeat}
         if hasattr(integrator, "train"):
-            progress = self._progress(f"{case.spec.label}: training {plan.steady_frames} frames")
+            progress = self._progress(f"{name}: training {plan.steady_frames} frames")
             pretrain, interrupted = budget.train(scene, integrator, plan.steady_frames, progress=progress)
             if interrupted:
                 raise KeyboardInterrupt
-            facts = {"pretrain_frames": plan.steady_frames, "seconds_pretrain": pretrain}
+            facts |= {"pretrain_frames": plan.steady_frames, "seconds_pretrain": pretrain}
 
         pass_times: dict[int, float] = {}
         # A frame for nothing: what is made once per trained state shall not count as the cost of a frame
         for size in budget.pass_sizes(scene):
-            frame = budget.render_samples(scene, integrator, size, plan.seed + 1000)
+            frame = budget.render_samples(scene, integrator, size, seed + 1000)
             if frame.interrupted:
                 raise KeyboardInterrupt
             pass_times[size] = frame.seconds_render
 
-        self._progress(f"{case.spec.label}: 1-sample frames")
-        frames = []
+        self._progress(f"{name}: 1-sample frames")
+        samples = []
         for k in range(SAMPLE_FRAMES):
-            frames.append(budget.render_samples(scene, integrator, 1, plan.seed + k))
-            if frames[-1].interrupted:
+            samples.append(budget.render_samples(scene, integrator, 1, seed + k))
+            if samples[-1].interrupted:
                 break
-        self._rows(case, "sample", frames, plan.seed, **facts)
+        self._rows(case, "sample", samples, **facts)
 
         for seconds in plan.frame_seconds:
             for with_denoiser in (False, True) if self.guides else (False,):
-                progress = self._progress(f"{case.spec.label}: frames of {seconds:g} s")
+                progress = self._progress(f"{name}: frames of {seconds:g} s")
                 available = seconds - (self.denoise_seconds if with_denoiser else 0.0)
                 frames = []
                 for k in range(STEADY_FRAMES):
                     frame = budget.render_seconds(
-                        scene, integrator, available, plan.seed + k, pretrained=True, pass_times=pass_times
+                        scene, integrator, available, seed + k, pretrained=True, pass_times=pass_times
                     )
                     frames.append(frame)
                     if progress:
                         progress(k + 1, STEADY_FRAMES)
                     if frame.interrupted:
                         break
-                self._rows(
-                    case, "steady", frames, plan.seed, budget_seconds=seconds, only_denoised=with_denoiser, **facts
-                )
+                self._rows(case, "steady", frames, budget_seconds=seconds, only_denoised=with_denoiser, **facts)
+        parts = split.measure(scene, integrator).to_json()  # last, as it trains on
+        self._rows(case, "split", samples, only_denoised=False, split=parts, **facts)
+
+    def _begin(self, case: Case, plan: Plan, repeat: int) -> int:
+        """Forget what was learned; returns the seed of this repeat, which training follows as well."""
+        seed = plan.seed + SEED_STEP * repeat
+        budget.reset(case.integrator, seed if repeat else None)  # the first one trains by the seed among its keys
+        return seed
 
     # ----------------------------------------------------------------------------------------------------------------
 
-    def _rows(
-        self, case: Case, mode: str, frames: list[Rendered], seed: int, only_denoised: bool | None = None, **facts
-    ) -> None:
+    def _rows(self, case: Case, mode: str, frames: list[Rendered], only_denoised: bool | None = None, **facts) -> None:
         """Rows and pictures for frames of one kind: raw and denoised, or only one of the two."""
         variants = [False, True] if self.guides else [False]
         for denoised in variants if only_denoised is None else [only_denoised]:
@@ -237,14 +282,19 @@ class Bench:
                 mode,
                 frames,
                 images,
-                seed,
                 denoised=denoised,
                 seconds_denoise=seconds_denoise,
                 environment=self.environment,
                 **facts,
             )
-            flip_map = judge(row, images, self.reference, self.exposures)
-            self.on_picture(Picture(row, frames[0], images[0], flip_map))
+            row.peak_mib = memory.peak_mib() if self.counts_memory else None
+            flip_map = None
+            if mode == "curve":
+                row.relmse, row.relmse_trimmed = _relmse(images, self.reference)
+            elif mode != "split":
+                flip_map = judge(row, images, self.reference, self.exposures)
+            shown = (None, None, None) if mode in WITHOUT_PICTURE else (frames[0], images[0], flip_map)
+            self.on_picture(Picture(row, *shown))
         if any(f.interrupted for f in frames):
             raise KeyboardInterrupt
 
@@ -260,11 +310,9 @@ def make_row(
     denoised: bool,
     seconds_denoise: float,
     environment: dict[str, object],
-    budget_seconds: float | None = None,
-    pretrain_frames: int = 0,
-    seconds_pretrain: float = 0.0,
+    **further,
 ) -> Row:
-    """A row without errors. Times are medians over the frames, counts are sums."""
+    """A row without errors. Times are medians over the frames, counts are sums; `further` are fields as they are."""
     first, width_height = frames[-1].statistics, loaded.size
     spp = float(np.mean([f.spp for f in frames]))
     seconds_train = median(f.seconds_train for f in frames)
@@ -279,13 +327,10 @@ def make_row(
         size=list(width_height),
         seed=seed,
         mode=mode,
-        budget_seconds=budget_seconds,
         frames=len(frames),
-        pretrain_frames=pretrain_frames,
         denoised=denoised,
         spp=int(spp) if spp == int(spp) else spp,
         seconds_compile=case.seconds_compile,
-        seconds_pretrain=seconds_pretrain,
         seconds_train=seconds_train,
         seconds_render=seconds_render,
         seconds_denoise=seconds_denoise,
@@ -299,7 +344,12 @@ def make_row(
         interrupted=any(f.interrupted for f in frames),
         statistics=first,
         environment=environment,
+        **further,
     )
+
+
+def _name(case: Case, plan: Plan, repeat: int) -> str:
+    return case.spec.label + (f", {repeat + 1} of {plan.repeats}" if plan.repeats > 1 else "")
 
 
 def judge(
@@ -310,11 +360,19 @@ def judge(
         row.flicker = float(np.mean([metrics.smape(b, a) for a, b in pairwise(images)]))
     if reference is None:
         return None
-    found = [metrics.errors(image, reference.rgb, reference.variance, exposures) for image in images]
-    row.relmse = float(np.mean([e.relmse for e, _ in found]))
-    row.relmse_trimmed = float(np.mean([e.relmse_trimmed for e, _ in found]))
-    row.flip = float(np.mean([e.flip for e, _ in found]))
-    return found[0][1].map
+    row.relmse, row.relmse_trimmed = _relmse(images, reference)
+    found = [metrics.flip(image, reference.rgb, exposures) for image in images]
+    row.flip = float(np.mean([f.mean for f in found]))
+    return found[0].map
+
+
+def _relmse(images: list[np.ndarray], reference: Reference) -> tuple[float, float]:
+    """relMSE and trimmed relMSE, means over the images."""
+    known = reference.rgb, reference.variance
+    return (
+        float(np.mean([metrics.relmse(image, *known) for image in images])),
+        float(np.mean([metrics.relmse_trimmed(image, *known) for image in images])),
+    )
 
 
 def make_cases(

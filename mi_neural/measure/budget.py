@@ -3,7 +3,7 @@
 Dr.Jit works asynchronously: the clock is read after ``dr.sync_thread()`` only. Kernels are compiled before it starts
 (:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; what an integrator
 with a cache can do beyond Mitsuba's own is looked up by name: `train`, `train_seconds`, `train_first`,
-`train_fraction`, `prepare`, `plan_samples`, `statistics`, `reset`.
+`train_fraction`, `prepare`, `plan_samples`, `statistics`, `reset`, `reseed`.
 
 Ctrl-C ends a rendering early and keeps what has been rendered; the result says so. During training it ends the
 training, and one pass is rendered with what has been learned.
@@ -133,9 +133,11 @@ def statistics(integrator) -> dict[str, float]:
     return dict(integrator.statistics()) if hasattr(integrator, "statistics") else {}
 
 
-def reset(integrator) -> None:
-    """Forget what was learned, where there is something to forget."""
-    if hasattr(integrator, "reset"):
+def reset(integrator, seed: int | None = None) -> None:
+    """Forget what was learned, where there is something to forget; with a `seed` learn by other random numbers."""
+    if seed is not None and hasattr(integrator, "reseed"):
+        integrator.reseed(seed)
+    elif hasattr(integrator, "reset"):
         integrator.reset()
 
 
@@ -255,6 +257,7 @@ def render_seconds(
     pretrained: bool = False,
     pass_times: dict[int, float] | None = None,
     keep: Callable[[Rendered], None] | None = None,
+    watch: Callable[[Rendered], None] | None = None,
 ) -> Rendered:
     """Render as many samples as fit into `seconds` of wall time, kernels being compiled (:func:`warm_up`).
 
@@ -263,10 +266,12 @@ def render_seconds(
     The last pass may end up to half of a 1-sample pass late. At least one pass is rendered, however small the budget.
 
     `pass_times` (samples a pixel -> seconds) is read and updated: hand the same to every frame of a sequence.
-    `keep` is called every KEEP_SECONDS with the image so far, marked as interrupted.
+    `keep` is called every KEEP_SECONDS with the image so far, marked as interrupted; `watch` after 1, 2, 4, ... samples
+    a pixel, while the clock stands still.
     """
     start = clock()
     run = _Run(scene, integrator, seed, sensor, keep)
+    watch_at = 1
     times = {} if pass_times is None else pass_times
     sizes = pass_sizes(scene, sensor)
     try:
@@ -288,6 +293,11 @@ def render_seconds(
             expected = round((seconds - elapsed) / times[known] * known) if times else size
             run.plan(run.film.spp + max(size, expected))
             times[size] = run.one_pass(size)
+            if watch and run.film.spp >= watch_at:
+                paused = clock()
+                watch(run.result())
+                watch_at = 2 * run.film.spp
+                start += clock() - paused
     except KeyboardInterrupt:
         run.interrupted = True
         if run.film.spp == 0:

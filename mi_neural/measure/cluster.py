@@ -53,6 +53,10 @@ class ClusterError(InputError):
     """The cluster cannot do what it is asked; the message is one line and complete."""
 
 
+class JobError(ClusterError):
+    """One job cannot be done, on whatever worker."""
+
+
 # ------------------------------------------------------------------------------------------------------------------
 # On a worker
 
@@ -91,7 +95,7 @@ def work(job, packed: bytes | None = None) -> Answer:
     try:
         return _renderer(worker.state.nthreads).submit(run).result()
     except (ValueError, OSError, ImportError, RuntimeError) as error:
-        raise ClusterError(f"worker {name}: {one_line(error)}") from None
+        raise JobError(f"worker {name}: {one_line(error)}") from None
 
 
 def _by_value() -> Callable:
@@ -167,30 +171,30 @@ class Workers:
             time.sleep(LOOK_SECONDS / 4)
         return len(names)
 
-    def map(self, job_list: list, data: object = None) -> Iterator[tuple[int, Answer]]:
-        """Run jobs, each with `data` (sent once); yields (index, answer) as they are done, in any order.
+    def map(self, jobs_and_data: list[tuple[object, object]]) -> Iterator[tuple[int, Answer | JobError]]:
+        """Run jobs, each with its data (None: without; one object is sent once, for however many jobs).
 
-        A job whose worker dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what
-        has not begun. Raises :class:`ClusterError`: a job failed, took several workers with it, no worker or no
-        scheduler is there any more.
+        Yields (index, answer) as they are done, in any order; a job that failed gives its error. A job whose worker dies
+        is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun. Raises
+        :class:`ClusterError`: a job took several workers with it, no worker or no scheduler is there any more.
         """
-        import dask
-
-        waiting, finished, call = deque(enumerate(job_list)), queue.SimpleQueue(), _by_value()
+        waiting, finished, call = deque(range(len(jobs_and_data))), queue.SimpleQueue(), _by_value()
         running: dict[object, tuple[int, str]] = {}  # future -> job, worker
         losses: Counter[int] = Counter()
         seen = time.monotonic()
-        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
-            # A task and not scattered data: it is made anew where all workers that held it are gone
-            sent = () if data is None else (self.client.submit(bytes, pickle.dumps(data), pure=False),)
+        sent: dict[int, object] = {}  # id of data -> future
 
         def hand_out(names: list[str]) -> None:
             busy = {name for _, name in running.values()}
             for name in names:
                 if waiting and name not in busy:
-                    index, _ = waiting[0]
-                    packed = pickle.dumps(partial(work, waiting.popleft()[1]))
-                    future = self.client.submit(call, packed, *sent, workers=[name], pure=False)
+                    index = waiting.popleft()
+                    job, data = jobs_and_data[index]
+                    if data is not None and id(data) not in sent:
+                        sent[id(data)] = self._send(data)
+                    further = () if data is None else (sent[id(data)],)
+                    packed = pickle.dumps(partial(work, job))
+                    future = self.client.submit(call, packed, *further, workers=[name], pure=False)
                     running[future] = index, name
                     future.add_done_callback(finished.put)
 
@@ -202,7 +206,7 @@ class Workers:
                     f"a job lost {losses[index]} workers, one after the other, the last at {name}: look at their logs; "
                     "if memory was too small, start them with a larger --memory-limit"
                 )
-            waiting.appendleft((index, job_list[index]))
+            waiting.appendleft(index)
 
         try:
             while waiting or running:
@@ -230,15 +234,29 @@ class Workers:
             if running and self.client.status == "running":
                 self.client.cancel(list(running), force=True)
 
-    def _fetch(self, future) -> Answer | None:
+    def run(self, jobs_and_data: list[tuple[object, object]]) -> Iterator[tuple[int, Answer]]:
+        """As :meth:`map`, for jobs that are nothing without one another: the first that fails ends all."""
+        for index, answer in self.map(jobs_and_data):
+            if isinstance(answer, JobError):
+                raise answer
+            yield index, answer
+
+    def _send(self, data):
+        """Data as a future. A task and not scattered: it is made anew where all workers that held it are gone."""
+        import dask
+
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
+            return self.client.submit(bytes, pickle.dumps(data), pure=False)
+
+    def _fetch(self, future) -> Answer | JobError | None:
         """The answer of a job that is done; None where its worker has died since."""
         distributed = _distributed()
         if not future.done():
             return None
         try:
             return future.result(timeout=FETCH_SECONDS)
-        except ClusterError:
-            raise
+        except JobError as error:
+            return error
         except (distributed.TimeoutError, distributed.KilledWorker):
             return None
         except ModuleNotFoundError as error:
@@ -332,7 +350,8 @@ def render_samples(
     kept = budget.clock()
     try:
         parts = plan_parts(setup, passes, PARTS_PER_WORKER * workers.count(), seed)
-        for _, answer in workers.map(parts, jobs.cache_bytes(case.integrator)):
+        learned = jobs.cache_bytes(case.integrator)
+        for _, answer in workers.run([(part, learned) for part in parts]):
             merged.add(answer)
             if progress:
                 progress(merged.film.spp, spp)
@@ -394,13 +413,12 @@ def frames_of(
 
     def render(case: benchmark.Case, frames: range) -> Iterator[sequence.Frame]:
         setup = jobs.Setup.of(loaded, case, size, merge=False)
-        job_list = [
-            jobs.Frame(setup, tuple(texts), over_time.frames, over_time.change_at, frame, plan.spp, plan.seed)
-            for frame in frames
-        ]
+        facts = (setup, tuple(texts), over_time.frames, over_time.change_at)
+        learned = jobs.cache_bytes(case.integrator)
+        of_frames = [(jobs.Frame(*facts, frame, plan.spp, plan.seed), learned) for frame in frames]
         early: dict[int, sequence.Frame] = {}
         following = 0
-        for index, answer in workers.map(job_list, jobs.cache_bytes(case.integrator)):
+        for index, answer in workers.run(of_frames):
             rendered, seconds_update = answer.value
             early[index] = sequence.Frame(rendered, seconds_update, answer.environment)
             while following in early:

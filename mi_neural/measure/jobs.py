@@ -54,7 +54,7 @@ class Setup:
     """A scene and an integrator, as another process can make them anew.
 
     scene       name of a shipped scene, or the path of a file that the other process must see as well
-    digest      of that file
+    digest      of that file and those that it names
     size        (width, height) of the film, None: the scene's own
     parameters  values for the scene's `$parameters`
     merge       as for :func:`load_scene`
@@ -93,14 +93,12 @@ class Setup:
                     f"it has {name} {version}, the process that asks has {self.versions[name]}: install the same there"
                 )
         try:
-            path = find_scene(self.scene)
+            find_scene(self.scene)
         except InputError:
             raise InputError(
                 f"it sees no file {self.scene}: put scene, meshes and textures where all workers see them by the same "
                 "path"
             ) from None
-        if hashlib.sha256(path.read_bytes()).hexdigest() != self.digest:
-            raise InputError(f"its {path} is another file than the one here: put the same there")
 
 
 class Workbench:
@@ -118,7 +116,7 @@ class Workbench:
         """Scene and integrator of a setup; those of the last one as far as they are the same."""
         import mitsuba as mi
 
-        if setup == self.setup:
+        if setup == self.setup and self.case.integrator is not None:
             return self.loaded, self.case
         setup.check()
         same_scene = self.setup is not None and setup.own is self.setup.own is False
@@ -132,6 +130,10 @@ class Workbench:
         if not same_scene:
             own_keys = setup.spec.keys if setup.own else None
             self.loaded = load_scene(setup.scene, setup.size, setup.parameters, own_keys, setup.merge)
+            if self.loaded.digest != setup.digest:
+                raise InputError(
+                    f"its {self.loaded.path}, or a file that it names, is not the one here: put the same there"
+                )
         if setup.own:
             self.case = benchmark.own_case(self.loaded, setup.spec.keys)
         else:
@@ -238,18 +240,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class Measurement:
-    """All rows of one integrator of a comparison, measured against one reference."""
+    """All rows of one integrator of a comparison."""
 
     setup: Setup
     plan: benchmark.Plan
-    denoise: bool
 
-    def run(self, reference: Reference) -> list[benchmark.Picture]:
-        """The rows with their pictures. The denoiser's guides are rendered here, their time belongs to nobody."""
-        if self.denoise:
+    def run(self, given: tuple[Reference, denoise.Guides | None]) -> list[benchmark.Picture]:
+        """The rows with their pictures; `given`: what all integrators are compared with, and denoised by."""
+        reference, guides = given
+        if guides is not None:
             denoise.require()
         loaded, case = workbench.ready(self.setup)
-        guides = denoise.render_guides(loaded.scene, self.plan.seed) if self.denoise else None
         pictures: list[benchmark.Picture] = []
         bench = benchmark.Bench(loaded, reference, guides, environment.describe(), pictures.append)
         bench.run([case], self.plan)

@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from . import exr
-from .benchmark import Picture, Row, judge, plain
+from .benchmark import WITHOUT_PICTURE, Picture, Row, judge, plain
 from .reference import Reference
 
 FILE = "rows.jsonl"
@@ -34,8 +34,8 @@ def settings_of(loaded, cases, plan, reference: Reference, denoised: bool) -> di
 class Kept:
     """Rows in `folder` that were measured with the same `settings`; those of others are forgotten.
 
-    A row is known by label, mode, budget and whether it was denoised. One that an interruption cut short does not
-    count.
+    A row is known by label, mode, budget, whether it was denoised, and repeat; those of a curve by their samples, too.
+    One that an interruption cut short does not count.
     """
 
     def __init__(self, folder: Path, settings: dict[str, object]) -> None:
@@ -46,25 +46,35 @@ class Kept:
             if json.loads(lines[0])["settings"] == settings:
                 for line in lines[1:]:
                     row = Row(**json.loads(line))
-                    if not row.interrupted and (folder / str(row.image)).is_file():
+                    there = row.mode in WITHOUT_PICTURE or (folder / str(row.image)).is_file()
+                    if not row.interrupted and there:
                         self.rows[_key(row)] = row
         except (IndexError, KeyError, TypeError, ValueError):
             pass  # nothing there, not ours, or the end of an interrupted write: what was read so far counts
         exr.write_text(self.path, json.dumps({"settings": settings}) + "\n" + "".join(map(_line, self.rows.values())))
 
     def add(self, row: Row) -> None:
-        """Remember a row whose image is written."""
+        """Remember a row, whose image, if it has one, is written. One that was remembered before is nothing new."""
+        if self.rows.get(_key(row)) is row:
+            return
         self.rows[_key(row)] = row
         with open(self.path, "a", encoding="utf-8") as file:
             file.write(_line(row))
 
     def pictures(self, keys: list[tuple], reference: Reference | None, exposures) -> list[Picture] | None:
-        """The rows of `keys` (label, mode, budget, denoised) with their images; None if one is missing."""
+        """The rows of `keys` (label, mode, budget, denoised, repeat) with their images, and before them the curves that
+        belong to them; None if a row is missing."""
         found = []
         for key in keys:
             if key not in self.rows:
                 return None
             row = self.rows[key]
+            if row.mode in WITHOUT_PICTURE:
+                found.append(Picture(row, None, None, None))
+                continue
+            if row.mode == "one-shot":
+                curve = (row.label, "curve", *key[2:])
+                found += [Picture(r, None, None, None) for k, r in self.rows.items() if k[: len(curve)] == curve]
             try:
                 rgb = exr.read(self.folder / str(row.image)).rgb
             except (OSError, ValueError):
@@ -80,7 +90,8 @@ class Kept:
 
 
 def _key(row: Row) -> tuple:
-    return row.label, row.mode, row.budget_seconds, row.denoised
+    key = (row.label, row.mode, row.budget_seconds, row.denoised, row.repeat)
+    return (*key, row.spp) if row.mode == "curve" else key
 
 
 def _line(row: Row) -> str:

@@ -35,7 +35,7 @@ class LoadedScene:
     name        as typed, without folder and suffix unless the file is called `scene.xml`, which takes its folder's name
     path        the XML file
     parameters  values given for the scene's `$parameters`
-    digest      SHA-256 of the XML file (not of the meshes and textures it refers to)
+    digest      SHA-256 of the XML file, of what it includes, and of the meshes, textures and other files that it names
     carried     `max_depth`, `rr_depth`, `hide_emitters` of the scene's own integrator, as far as it sets them
     integrator  plugin name of the scene's own integrator
     """
@@ -82,14 +82,15 @@ def find_scene(name: str) -> Path:
 
 def load_scene(
     name: str,
-    size: tuple[int, int] | None = None,
+    size: tuple[int, int] | list[tuple[int, int]] | None = None,
     parameters: dict[str, str] | None = None,
     integrator_keys: dict[str, object] | None = None,
     merge: bool = True,
 ) -> LoadedScene:
     """Load a scene file or shipped scene under the active variant.
 
-    size             (width, height) for the film of every sensor; a crop window is dropped
+    size             (width, height) for the film of every sensor, of several the one whose shape is nearest to that of
+                     the scene's own film; a crop window is dropped
     parameters       values for the scene's `$parameters`
     integrator_keys  keys to set on the scene's own integrator
     merge            let Mitsuba join meshes and equal materials, as it does by default; without it each keeps its name
@@ -105,6 +106,7 @@ def load_scene(
     config.merge_meshes = config.merge_equivalent = merge
     with _resolving(path.parent), _readable(path, parameters):
         state = mi.parser.parse_file(config, str(path), **parameters)
+        digest = _digest(state)
         _set_film_size(state, size)
         own = _own_integrator(state)
         for key, value in (integrator_keys or {}).items():
@@ -125,7 +127,7 @@ def load_scene(
         name=path.parent.name if path.stem == "scene" else path.stem,
         path=path,
         parameters=parameters,
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
+        digest=digest,
         carried=carried,
         integrator=own.props.plugin_name() if own is not None else "path",
     )
@@ -138,17 +140,34 @@ def scene_parameters(path: Path) -> list[str]:
     return sorted(set(declared) | set(re.findall(r"\$(\w+)", text)))
 
 
-def _set_film_size(state, size: tuple[int, int] | None) -> None:
+def _digest(state) -> str:
+    """SHA-256 of all files that a parsed scene consists of: XML, and what is named by `filename` and is there."""
+    import mitsuba as mi
+
+    named = [str(node.props["filename"]) for node in state.nodes if "filename" in node.props]
+    found = [Path(str(mi.file_resolver().resolve(name))) for name in dict.fromkeys(named)]
+    digest = hashlib.sha256()
+    for file in (*(Path(str(name)) for name in state.files), *found):
+        if file.is_file():
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _set_film_size(state, size: tuple[int, int] | list[tuple[int, int]] | None) -> None:
     import mitsuba as mi
 
     if size is None:
         return
-    for node in state.nodes:
-        if node.type == mi.ObjectType.Film:
-            node.props["width"], node.props["height"] = size
-            for key in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
-                if key in node.props:
-                    del node.props[key]
+    films = [node for node in state.nodes if node.type == mi.ObjectType.Film]
+    if isinstance(size, list):
+        own = films[0].props if films else {}
+        width, height = (int(own[key]) if key in own else n for key, n in (("width", 768), ("height", 576)))
+        size = min(size, key=lambda s: abs(np.log(s[0] * height / (s[1] * width))))
+    for node in films:
+        node.props["width"], node.props["height"] = size
+        for key in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
+            if key in node.props:
+                del node.props[key]
 
 
 def _own_integrator(state):

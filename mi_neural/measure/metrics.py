@@ -118,6 +118,29 @@ def relative_squared_errors(
     return weight * (image - reference) ** 2, weight * variance
 
 
+def bias_and_variance(
+    images: list[np.ndarray], reference: np.ndarray, variance: np.ndarray | None = None
+) -> tuple[float, float]:
+    """Relative squared bias and variance of one image, from two or more independent images of an estimator.
+
+    Their sum is the images' mean trimmed relMSE. The bias is estimated without the noise of the images, from products
+    of different ones: E[(I_j - R)(I_k - R)] = (E I - R)^2 for all pairs, which is the mean over all ways to halve the
+    images and multiply; what the noise of the reference adds to it (`variance`, as in :func:`relmse`) is subtracted. It
+    may come out negative where it is below what the samples resolve. Values are ranked for trimming by their mean
+    squared error, which says nothing of the products' sign. Raises ``ValueError`` for fewer than two images.
+    """
+    n = len(images)
+    if n < 2:
+        raise ValueError(f"bias and variance are told apart by two images or more, got {n}")
+    total = np.mean([relative_squared_errors(image, reference)[0] for image in images], axis=0)
+    mean = np.mean([_black_where_nonfinite(_as_image(image, "image")) for image in images], axis=0)
+    of_mean, noise = relative_squared_errors(mean, reference, variance)
+    order = np.argsort(total, axis=None)[: max(1, total.size - ceil(TRIM_FRACTION * total.size))]
+    squared = (n * of_mean - total) / (n - 1) - noise
+    spread = n * (total - of_mean) / (n - 1)
+    return float(squared.ravel()[order].mean()), float(spread.ravel()[order].mean())
+
+
 def smape(image: np.ndarray, previous: np.ndarray, epsilon: float = SMAPE_EPSILON) -> float:
     """Symmetric mean absolute percentage error with the factor 2: mean of 2 |a - b| / (|a| + |b| + eps), in [0, 2].
 

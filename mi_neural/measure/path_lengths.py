@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from . import environment, exr, load
-from .metrics import TRIM_FRACTION, relative_squared_errors
+from .metrics import bias_and_variance
 from .reference import Reference, load_reference
 
 #: Constants c of the spread test a > c a_0.
@@ -40,21 +40,6 @@ class Point:
     bias: float
 
 
-def squared_bias(first: np.ndarray, second: np.ndarray, reference: Reference) -> float:
-    """Relative squared bias of an estimator from two independent images of it, without the largest 0.1 % of its values.
-
-    ``E[(I - R)(I' - R)] = (E I - R)²``: the noise of either image cancels, whatever it is; that of the reference is
-    subtracted as in relMSE. Values are ranked by (I - R)² + (I' - R)², which says nothing of the product's sign. May
-    come out negative where the bias is below what the samples resolve.
-    """
-    total, noise = relative_squared_errors(0.5 * (first + second), reference.rgb, reference.variance)
-    # (I - R)(I' - R) = ((I + I')/2 - R)² - ((I - I')/2)², each weighted as relMSE does
-    spread, _ = relative_squared_errors(reference.rgb + 0.5 * (first - second), reference.rgb)
-    values = total - spread - noise
-    order = np.argsort(total + spread, axis=None)[: values.size - math.ceil(TRIM_FRACTION * values.size)]
-    return float(values.ravel()[order].mean())
-
-
 def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[float, float]:
     """(squared bias, mean depth) of a trained integrator that is not trained on. Each image is planned as one of a
     single sample, so that what depends on the sample count (`adaptive`) stays at its most biased setting."""
@@ -66,7 +51,7 @@ def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[floa
     names = integrator.aov_names()
     rgb = [np.asarray(i[..., :3], np.float64) for i in images]
     depth = np.mean([i[..., i.shape[-1] - len(names) + names.index("depth")] for i in images], axis=0)
-    return squared_bias(*rgb, reference), float(depth.mean())
+    return bias_and_variance(rgb, reference.rgb, reference.variance)[0], float(depth.mean())
 
 
 def curve(scene, name: str, keys: dict, thresholds, reference: Reference, samples: int, frames: int) -> list[Point]:

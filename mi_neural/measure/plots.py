@@ -19,6 +19,8 @@ import numpy as np
 from . import exr, metrics, report
 from .benchmark import plain
 from .load import LoadedScene
+from .page import flip_colours
+from .page import style as page_style
 from .sequence import Result, Run
 
 #: Frames after a change that count as the first response, and frames after it from which all should have settled.
@@ -321,7 +323,7 @@ def _montage_rows(found: Found, frames: list[int]):
             image = references.of(frame).rgb if number is None else found.results[number].image(frame).rgb
             if label == "FLIP":
                 means[r, frame] = metrics.flip(image, references.of(frame).rgb, references.exposures).map
-                shown[r, frame] = report.flip_colours(means[r, frame])
+                shown[r, frame] = flip_colours(means[r, frame])
             elif label == "SMAPE":
                 if frame:
                     means[r, frame] = metrics.smape_map(image, found.results[number].image(frame - 1).rgb)
@@ -452,7 +454,7 @@ def page(found: Found, pictures: dict[str, bytes], animated: bytes) -> str:
         f"<pre>{html.escape(chr(10).join(f'{k:16} {v}' for k, v in found.run.environment.items()))}</pre>",
     ]
     head = '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-    style = report.STYLE + "img { max-width: 100% } img[src^='data:image/gif'] { image-rendering: pixelated }\n"
+    style = page_style() + "img { max-width: 100% } img[src^='data:image/gif'] { image-rendering: pixelated }\n"
     title = html.escape(f"{found.loaded.name}: sequence")
     body = "\n".join(part for part in parts if part)
     return f"{head}\n<title>{title}</title>\n<style>{style}</style></head><body>\n{body}\n</body></html>\n"

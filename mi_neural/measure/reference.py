@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +50,19 @@ class Reference:
             return None
         return float(relative_squared_errors(self.rgb, self.rgb, self.variance)[1].mean())
 
+    def standard_error(self) -> float | None:
+        """Relative standard error of a pixel, the root mean square over the image: :meth:`noise_floor`'s root."""
+        noise = self.noise_floor()
+        return None if noise is None else noise**0.5
+
+    def facts(self) -> dict[str, object]:
+        """What results say about it."""
+        return {
+            **self.metadata, "path": str(self.path), "noise_relmse": self.noise_floor(),
+            "standard_error": self.standard_error(), "variance_subtracted": self.variance is not None,
+            "seconds": self.seconds,
+        }  # fmt: skip
+
 
 def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Reference:
     """Read a reference and check it against the size (width, height) that will be rendered.
@@ -73,6 +87,20 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Ref
     if variance is not None and not (np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise InputError(f"the reference {path} has negative or non-finite values in variance.*: render it anew")
     return Reference(image.rgb, variance, image.metadata, path)
+
+
+def beside(path: Path, size: tuple[int, int]) -> Path | None:
+    """A reference of this size in the scene file's own folder: `reference_640x360.exr` for `scene.xml`, else
+    `NAME_reference_640x360.exr`; None where there is none."""
+    name = f"reference_{size[0]}x{size[1]}.exr"
+    file = path.parent / (name if path.stem == "scene" else f"{path.stem}_{name}")
+    return file if file.is_file() else None
+
+
+def cache_folder() -> Path:
+    """Where references are kept for all comparisons of this user: under `XDG_CACHE_HOME`, by default `~/.cache`."""
+    base = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
+    return Path(base or Path.home() / ".cache") / "mi_neural" / "references"
 
 
 def depth_warning(reference: Reference, max_depth: object) -> str | None:
@@ -103,9 +131,12 @@ def pass_spp(scene) -> int:
 
 
 def reference_path(loaded: LoadedScene, folder: Path, state: str = "") -> Path:
-    """Where the reference of this scene file, these parameters, this film and this state of the scene is kept."""
+    """Where the reference of this scene's files, these parameters, this film, this version of Mitsuba and this state of
+    the scene is kept. The number of samples is not part of the name: it can grow."""
+    import mitsuba as mi
+
     facts = [loaded.digest, sorted(loaded.parameters.items()), loaded.size, sorted(loaded.carried.items())]
-    facts += [state] if state else []
+    facts += [mi.__version__, *([state] if state else [])]
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:12]
     return folder / f"reference_{loaded.name}_{key}.exr"
 
@@ -120,10 +151,9 @@ def render_reference(
 ) -> Reference:
     """The reference for a scene with at least `spp` samples a pixel, by Mitsuba's `path` at the scene's depth.
 
-    Kept in `folder` under a name made of scene file, parameters and size. One with enough samples is taken as it is,
-    one with fewer is continued. Meshes and textures are not part of the name: after changing them delete the file; for
-    a scene whose parameters were changed in memory, give a `state` that tells these changes from others. On Ctrl-C the
-    passes so far are written and ``KeyboardInterrupt`` goes on to the caller.
+    Kept in `folder` under the name that :func:`reference_path` gives. One with enough samples is taken as it is, one
+    with fewer is continued. For a scene whose parameters were changed in memory, give a `state` that tells these
+    changes from others. On Ctrl-C the passes so far are written and ``KeyboardInterrupt`` goes on to the caller.
     """
     path, size = reference_path(loaded, folder, state), pass_spp(loaded.scene)
     n_passes = max(2, -(-spp // size))

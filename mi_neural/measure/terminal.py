@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from mi_neural.measure import benchmark, budget, exr, load, report
+from mi_neural.measure import benchmark, budget, exr, load, repeats, report
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
@@ -30,6 +30,11 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if not match or min(int(match[1]), int(match[2])) < 1:
         raise InputError(f"--size takes WIDTHxHEIGHT in pixels, both at least 1, like 640x360; got {text!r}")
     return int(match[1]), int(match[2])
+
+
+def parse_sizes(text: str | None) -> list[tuple[int, int]] | None:
+    """Sizes separated by commas: each scene takes the one nearest in shape to its own film."""
+    return None if text is None else [parse_size(part) for part in text.split(",")]
 
 
 def parse_seconds(option: str, text: str) -> list[float]:
@@ -186,6 +191,11 @@ class Bars:
         return lambda done, total: self.progress.update(self.task, completed=done, total=total)
 
 
+def counted(n: int, noun: str) -> str:
+    """`1 worker`, `2 workers`."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
 def announce(text: str) -> None:
     err.print(text, soft_wrap=True, markup=False)
 
@@ -217,13 +227,14 @@ def _write_image(path: Path, row: benchmark.Row, image, rendered: budget.Rendere
 
 
 def slug(row: benchmark.Row) -> str:
-    """A file name for a row: nirc_cache_samples-8_steady_0.25s_denoised."""
+    """A file name for a row: nirc_cache_samples-8_steady_0.25s_denoised_2 (second repeat)."""
     name = re.sub(r"[^\w.-]+", "_", row.label.replace("=", "-"))
     parts = [
         name,
         row.mode,
         f"{row.budget_seconds:g}s" if row.budget_seconds else "",
         "denoised" if row.denoised else "",
+        str(row.repeat + 1) if row.repeat else "",
     ]
     return "_".join(part for part in parts if part)
 
@@ -235,19 +246,21 @@ def notes(reference: references.Reference, denoised: bool) -> list[str]:
         notes.append(f"Reference: {spp} spp; it carries no variance, so its own noise is part of every error.")
     else:
         notes.append(
-            f"Reference: {spp} spp; its own noise, {reference.noise_floor():.2g} in relMSE, is subtracted from both "
-            "relMSE figures and not from FLIP."
+            f"Reference: {spp} spp, standard error of a pixel {100 * reference.standard_error():.2g} %; that noise, "
+            f"{reference.noise_floor():.2g} in relMSE, is subtracted from both relMSE figures and not from FLIP."
         )
     if denoised:
         notes.append("One-shot budgets do not contain the denoiser's time, frames of steady rows do.")
     return notes
 
 
-def print_rows(rows: list[benchmark.Row]) -> None:
-    if not rows:
+def print_rows(groups: list[repeats.Group]) -> None:
+    """The table of rows that were grouped by their repeats, and what was left out."""
+    shown = [g for g in groups if g.first.mode != "split"]
+    if not shown:
         return
-    print_table(report.table(rows))
-    if n := sum(row.nonfinite for row in rows):
+    print_table(report.table(shown))
+    if n := sum(row.nonfinite for g in shown for row in g.rows):
         out.print(f"{n} non-finite samples or pixels were left out", markup=False)
 
 
