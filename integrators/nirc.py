@@ -128,6 +128,7 @@ class NIRCIntegrator(CacheIntegrator):
         _, mean, square, sampler = dr.while_loop(
             (mi.UInt32(0), mi.Float(0), mi.Float(0), sampler), lambda k, *_: k < 4, once
         )
+        dr.eval(mean, square, L)  # one kernel, not one for each
         variance = np.array(dr.maximum(square - dr.square(mean), 0)) * (4 / 3)
         # Relative to the brightness of the place, the scene's mean being its floor
         level = float(np.mean(np.array(mean + dr.mean(L))))
