@@ -259,16 +259,6 @@ class CacheIntegrator(mi.SamplingIntegrator):
         if self.light_sampler is not None:
             self.light_sampler.reset()
 
-    def use_cache(self, cache) -> None:
-        """Train and ask `cache` from now on, which starts anew: one of the class that this integrator has, or of a
-        class of your own that derives from it (:mod:`mi_neural.caches.arrays`). Raises ValueError for any other."""
-        own = type(self.cache)
-        self._check(isinstance(cache, own), f"use_cache() takes an {own.__name__}, or a class of your own derived from "
-                    f"it; got {type(cache).__name__}")  # fmt: skip
-        self.cache = cache
-        self.state.passes.clear()
-        self.reset()
-
     def _ready(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
         known = self.state.watch.parts

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.caches.blend import sigma_channels
-from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.incident import IncidentCache
+from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
 from mi_neural.caches.pair import PairCache
 from mi_neural.integrators import automatic
 from mi_neural.integrators.automatic import AUTO
@@ -44,6 +45,18 @@ class NIRCIntegrator(CacheIntegrator):
             self.cache = PairCache(
                 training, self.cache.training, self.cache.shape, self.seed, n_queries=self.cache_samples
             )
+
+    def use_cache(self, cache) -> None:
+        """Train and ask `cache` from now on; it starts anew. An :class:`~mi_neural.caches.incident.IncidentCache`, or one
+        of a class of your own that derives from it, see :mod:`mi_neural.caches.arrays`. Raises ValueError for another,
+        and with termination ``auto``, which has two of its own."""
+        self._check(self.termination != "auto", "use_cache() does not work with termination 'auto', which has two caches "
+                    "of its own")  # fmt: skip
+        self._check(isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache),
+                    f"use_cache() takes an IncidentCache or a class derived from it; got {type(cache).__name__}")  # fmt: skip
+        self.cache = cache
+        self.state.passes.clear()
+        self.reset()
 
     @property
     def needs_cache(self) -> bool:
