@@ -498,6 +498,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         settings = _opaque(self.settings(self.state.planned_spp or spp))
         box = film.rfilter().is_box_filter()
         field = self.cache.asked if self.needs_cache else None
+        keys = tuple((k, v) for k, v in vars(self).items() if type(v) in (int, float, str))
 
         # A row of pixels at a time if one sample of all is too much, else several samples at a time
         done = 0
@@ -506,7 +507,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             rows = height if n * n_pixels <= 2 * PASS_SAMPLES else max(1, PASS_SAMPLES // (n * width))
             for y in range(0, height, rows):
                 n_rows = min(rows, height - y)
-                key = (id(scene), id(sensor), width, n_rows, n, box, border)
+                key = (id(scene), id(sensor), width, n_rows, n, box, border, keys)
                 if key not in self.state.passes:
                     self.state.passes[key] = self._frozen_pass(
                         width, n_rows, n, border, box, self.cache.freezes(sensor)

@@ -28,6 +28,8 @@ LAYERS = [
     {"emitters"},  # light samplers do not know integrators
     {"integrators"},
     {"measure"},
+    {"explore"},
+    {"commands"},
     {"cli"},
 ]
 # The package's own start-up imports any room when a variant is set; others may ask it about the variant.

@@ -1,0 +1,1 @@
+"""The commands of `mi-neural`, one a file."""

@@ -1,0 +1,35 @@
+"""`mi-neural info`: what is installed."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from mi_neural.commands import options
+from mi_neural.measure import environment, terminal
+
+
+@options.readable
+def info() -> None:
+    """Versions, variants, LLVM, cores."""
+    import mitsuba as mi
+
+    import mi_neural
+    from mi_neural import emitters, integrators, registration, scenes
+
+    facts = environment.describe()
+    llvm = mi_neural.llvm.describe()
+    facts["variant"] = f"{terminal.DEFAULT_VARIANT} by default; plugins work under {', '.join(registration.SUPPORTED)}"
+    facts["llvm"] = llvm["version"] and f"{llvm['version']} from {llvm['source']}: {llvm['path']}"
+    del facts["llvm_source"]
+    if llvm["problem"]:
+        facts["llvm problem"] = llvm["problem"]
+    facts["variants"] = ", ".join(mi.variants())
+    facts["integrators"] = ", ".join(registration.plugin_names(integrators))
+    facts["emitters"] = ", ".join(registration.plugin_names(emitters))
+    facts["scenes"] = ", ".join(scenes.names())
+
+    table = Table.grid(padding=(0, 2))
+    for name, value in facts.items():
+        missing = "not installed: pip install 'mi_neural[denoise]'" if name == "mitsuba-oidn" else "none"
+        table.add_row(name, str(value or missing))
+    terminal.out.print(table)

@@ -1,0 +1,49 @@
+"""Options that several commands share, and how a command says what went wrong."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+from mi_neural.measure import load, terminal
+from mi_neural.measure.load import InputError
+
+Scene = Annotated[str, typer.Argument(metavar="SCENE", help="a Mitsuba XML file, or the name of a shipped scene")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="a key of the integrator; a.b=v reaches into a nested plugin"),
+]
+Define = Annotated[
+    list[str] | None, typer.Option("--define", "-D", metavar="NAME=VALUE", help="a $parameter of the scene")
+]
+Size = Annotated[str | None, typer.Option(metavar="WxH", help="size of the film, whatever the scene says")]
+Seed = Annotated[int, typer.Option(min=0, help="same seed, same image")]
+Variant = Annotated[str, typer.Option(help="Mitsuba variant")]
+ReferenceFile = Annotated[
+    str | None, typer.Option("--reference", metavar="REF.exr", help="measure errors against this image")
+]
+Denoise = Annotated[bool, typer.Option("--denoise", help="Open Image Denoise with albedo and normals as guides")]
+
+
+def readable(command: Callable) -> Callable:
+    """Run a command so that what goes wrong is one line on stderr and an exit code."""
+
+    @functools.wraps(command)
+    def wrapper(*args, **kwargs):
+        try:
+            return command(*args, **kwargs)
+        except KeyboardInterrupt as error:
+            terminal.err.print(str(error) or "interrupted", soft_wrap=True, markup=False)
+            raise typer.Exit(128 + terminal.stopped_by()) from None
+        except (ValueError, OSError, ImportError, RuntimeError) as error:
+            if os.environ.get("MI_NEURAL_TRACEBACK"):
+                raise
+            hint = "" if isinstance(error, (InputError, ImportError)) else " (MI_NEURAL_TRACEBACK=1 shows where)"
+            terminal.err.print(f"mi-neural: {load.one_line(error)}{hint}", soft_wrap=True, markup=False)
+            raise typer.Exit(2) from None
+
+    return wrapper

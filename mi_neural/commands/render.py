@@ -1,0 +1,146 @@
+"""`mi-neural render`: one image of one integrator, with its facts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mi_neural.commands import options
+from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, terminal
+from mi_neural.measure import reference as references
+from mi_neural.measure.load import InputError
+
+
+@options.readable
+def render(
+    scene: options.Scene,
+    integrator: Annotated[
+        str | None,
+        typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="default: the scene's own, else path"),
+    ] = None,
+    set_: options.Set = None,
+    define: options.Define = None,
+    spp: Annotated[int | None, typer.Option(help="samples a pixel; default: what the scene says")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="wall time instead of samples, training included, compiling not")
+    ] = None,
+    pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before the clock starts")] = 0,
+    size: options.Size = None,
+    seed: options.Seed = 0,
+    variant: options.Variant = terminal.DEFAULT_VARIANT,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="OUT.exr|png", help="default: SCENE_INTEGRATOR.exr")
+    ] = None,
+    reference: options.ReferenceFile = None,
+    denoise_: options.Denoise = False,
+    save_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what was learned")] = None,
+    load_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="start from what was learned")] = None,
+    json_: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="write the facts")] = None,
+) -> None:
+    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute."""
+    if spp is not None and seconds is not None:
+        raise InputError("--spp and --seconds exclude each other: give one of them")
+    terminal.positive("--spp", spp)
+    terminal.positive("--seconds", seconds)
+    if pretrain < 0:
+        raise InputError(f"--pretrain takes a number of frames from 0, got {pretrain}")
+    wanted_size, keys, parameters = (
+        terminal.parse_size(size),
+        load.parse_keys(set_ or []),
+        terminal.parse_define(define),
+    )
+    spec = load.parse_integrator(integrator) if integrator else None
+    if denoise_:
+        denoise.require()
+    if output is not None and output.suffix.lower() not in (".exr", ".png"):
+        raise InputError(f"-o takes a file that ends in .exr or .png, got {output}")
+    if load_cache is not None and not load_cache.is_file():
+        raise InputError(f"no cache file {load_cache}: leave --load-cache out or write one with --save-cache")
+    for file in (output or Path("image.exr"), json_, save_cache):
+        terminal.require_writable(file)
+
+    terminal.set_variant(variant)
+    loaded = load.load_scene(scene, wanted_size, parameters, None if spec else keys)
+    if spec:
+        spec.keys = {**keys, **spec.keys}
+        case = benchmark.make_cases(loaded, [spec])[0]
+    else:
+        case = benchmark.own_case(loaded, keys)
+    terminal.require_cache_methods(case, pretrain, save_cache, load_cache)
+    output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
+    ref = references.load_reference(reference, loaded.size) if reference else None
+    terminal.depth_notes(ref, loaded, [case])
+    terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
+
+    seconds_pretrain = 0.0
+
+    def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
+        row = benchmark.make_row(
+            loaded, case, "one-shot" if seconds is not None else "spp", [rendered], [image], seed,
+            denoised=denoise_ and image is not rendered.rgb, seconds_denoise=seconds_denoise,
+            environment=environment.describe(), budget_seconds=seconds, pretrain_frames=pretrain,
+            seconds_pretrain=seconds_pretrain,
+        )  # fmt: skip
+        row.image = str(output)
+        return row
+
+    def keep(so_far: budget.Rendered) -> None:
+        terminal.write_image(output, describe(so_far, so_far.rgb), so_far.rgb, so_far)
+
+    with terminal.Bars() as bars:
+        if denoise_:
+            bars("guides for the denoiser")
+            guides = denoise.render_guides(loaded.scene, seed)
+            denoise.warm_up(guides)
+        bars("compiling")
+        n = spp or loaded.default_spp
+        sizes = budget.pass_sizes(loaded.scene) if seconds else sorted(set(budget.plan_passes(loaded.scene, n)))
+        if seconds is None and not hasattr(case.integrator, "prepare"):
+            sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
+        case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
+        if load_cache is not None:
+            case.integrator.load_cache(str(load_cache))
+        bars_pretrain = bars(f"training {pretrain} frames") if pretrain else None
+        seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
+        seconds_first = 0.0
+        if seconds is None and not stopped:
+            bars_first = bars("training") if hasattr(case.integrator, "train_first") else None
+            seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
+        if stopped:  # the image that can be had at once
+            rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
+            rendered.interrupted = True
+        elif seconds is not None:
+            rendered = budget.render_seconds(
+                loaded.scene,
+                case.integrator,
+                seconds,
+                seed,
+                progress=bars(f"rendering for {seconds:g} s"),
+                pretrained=bool(pretrain or load_cache),
+                keep=keep,
+            )
+        else:
+            rendered = budget.render_samples(
+                loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
+            )
+        rendered.seconds_train += seconds_first
+        image, seconds_denoise = rendered.rgb, 0.0
+        if denoise_:
+            image, seconds_denoise = denoise.denoise(rendered.rgb, guides)
+
+    row = describe(rendered, image, seconds_denoise)
+    terminal.write_image(output, row, image, rendered)
+    if ref is not None:
+        benchmark.judge(row, [image], ref)
+        terminal.write_image(output, row, image, rendered)  # again, with the errors among its facts
+    if json_ is not None:
+        exr.write_text(json_, json.dumps(row.to_json(), indent=1) + "\n")
+    if save_cache is not None:
+        case.integrator.save_cache(str(save_cache))
+    terminal.print_rows([row])
+    terminal.out.print(f"wrote {output}", soft_wrap=True, markup=False)
+    if rendered.interrupted:
+        raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")

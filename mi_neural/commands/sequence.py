@@ -1,0 +1,128 @@
+"""`mi-neural sequence`: integrators on a scene that changes from frame to frame."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mi_neural.commands import options
+from mi_neural.measure import benchmark, changes, denoise, environment, load, plots, terminal
+from mi_neural.measure import sequence as sequences
+from mi_neural.measure.load import InputError
+
+DEFAULT_FRAMES = 60
+DEFAULT_REFERENCE_SPP = 256
+CHANGE_HELP = """a parameter of mi.traverse(scene), or the end of its name, as an expression of value (the original
+one), frame, n, t (0 to 1), after (1 from --change-at on), s (frames since): "sun.direction=rotated(value, [0,1,0],
+40*after)", "lamp.radiance=value*(1+t)", "ball.to_world=translate(0, 0.1*frame, 0) @ value" (meshes too), "wall.data=
+bitmap('f_%04d.exr')"; repeatable"""
+
+
+@options.readable
+def sequence(
+    scene: options.Scene,
+    integrator: Annotated[
+        list[str] | None,
+        typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="repeatable; default: path and nirc"),
+    ] = None,
+    change: Annotated[list[str] | None, typer.Option(metavar="KEY=EXPR", help=CHANGE_HELP)] = None,
+    frames: Annotated[int, typer.Option(metavar="N", help="number of frames")] = DEFAULT_FRAMES,
+    change_at: Annotated[
+        int | None, typer.Option(metavar="T", help="frame of an abrupt change: `after` and `s` count from it")
+    ] = None,
+    pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before frame 0")] = 0,
+    set_: options.Set = None,
+    define: options.Define = None,
+    spp: Annotated[int, typer.Option(help="samples a pixel of a frame")] = 1,
+    size: options.Size = None,
+    seed: options.Seed = 0,
+    variant: options.Variant = terminal.DEFAULT_VARIANT,
+    reference_spp: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help=f"samples of a reference, one per state of the scene; default {DEFAULT_REFERENCE_SPP}",
+        ),
+    ] = None,
+    no_reference: Annotated[bool, typer.Option("--no-reference", help="no references: SMAPE alone")] = False,
+    crop: Annotated[
+        list[str] | None, typer.Option(metavar="X,Y,W,H", help="repeatable; default: most and least changed region")
+    ] = None,
+    denoise_: options.Denoise = False,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
+) -> None:
+    """SCENE changing from frame to frame: frames, error and flicker over time, crops, an animated preview.
+
+    Ctrl-C keeps what is done; the same command goes on from there.
+    """
+    if output is None:
+        raise InputError("sequence needs a folder for its results: add -o DIR")
+    sequences.check_frames(frames, change_at)
+    terminal.positive("--spp", spp)
+    terminal.positive("--reference-spp", reference_spp)
+    if pretrain < 0:
+        raise InputError(f"--pretrain takes a number of frames from 0, got {pretrain}")
+    if no_reference and reference_spp is not None:
+        raise InputError("--no-reference and --reference-spp exclude each other: give one of them")
+    if change_at is not None and not change:
+        raise InputError("--change-at says when, but not what changes: add --change KEY=EXPR")
+    functions = changes.parse(change or [], frames, change_at)
+    specs = [load.parse_integrator(text) for text in integrator or ["path", "nirc"]]
+    wanted_size, keys, parameters = (
+        terminal.parse_size(size),
+        load.parse_keys(set_ or []),
+        terminal.parse_define(define),
+    )
+    if denoise_:
+        denoise.require()
+    terminal.require_folder(output)
+
+    terminal.set_variant(variant)
+    loaded = load.load_scene(scene, wanted_size, parameters, merge=False)
+    crops = terminal.parse_crops(crop, loaded.size)
+    cases = benchmark.make_cases(loaded, specs, keys)
+    over_time = sequences.Sequence(loaded.scene, functions, frames, change_at)
+    terminal.announce(
+        f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {frames} frames, {len(set(over_time.states))} states, "
+        f"{', '.join(s.label for s in specs)}, {variant}"
+    )
+
+    interrupted, notes = False, []
+    with terminal.Bars() as bars:
+        run = sequences.Run(
+            loaded,
+            over_time,
+            sequences.Plan(spp, pretrain, seed, denoise_),
+            output,
+            None if no_reference else reference_spp or DEFAULT_REFERENCE_SPP,
+            environment.describe(),
+            bars,
+        )
+        try:
+            run.run(cases)
+        except KeyboardInterrupt:
+            interrupted = True
+            notes.append("Interrupted: not all frames are there. The same command goes on from here.")
+        if run.references is not None and run.references.exposures is not None:
+            first, exposures = run.references.of(0), run.references.exposures
+            notes += terminal.depth_notes(first, loaded, cases) + terminal.notes(first, False)
+            notes.append(
+                f"FLIP: exposures {exposures.start:.2f} to {exposures.stop:.2f} stops in {exposures.num} steps for all "
+                "frames, from the lowest to the highest that any of the references asks for."
+            )
+        notes.append("SMAPE at the change contains the change itself; means of SMAPE leave that frame out.")
+        found = plots.Found(loaded, run, shlex.join(["mi-neural", *sys.argv[1:]]), crops, notes)
+        bars("plots and preview")
+        plots.write(found, output)
+
+    if found.results:
+        terminal.print_table(plots.table(found))
+        for note in notes:
+            terminal.out.print(note, soft_wrap=True, markup=False)
+        terminal.out.print(f"wrote {output / 'report.html'}", soft_wrap=True, markup=False)
+    if interrupted:
+        raise KeyboardInterrupt("interrupted: the same command goes on from here")
