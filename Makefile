@@ -6,10 +6,10 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/mi_neural.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture test stress lint clean
+.PHONY: help demo picture test stress notebooks lint clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 # The environment, made once and again whenever pyproject.toml changes.
 $(STAMP): pyproject.toml
@@ -37,6 +37,11 @@ test: $(STAMP)  ## the default tests, a few minutes on two cores
 
 stress: $(STAMP)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
 	$(BIN)/python tests/stress.py -o out/stress
+
+notebooks: $(STAMP)  ## run all notebooks in full length and keep their outputs, minutes
+	$(BIN)/python -m pip install --quiet -e '.[denoise,notebooks]'
+	$(BIN)/jupyter nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
+	    --ExecutePreprocessor.timeout=900 notebooks/*.ipynb
 
 lint: $(STAMP)  ## ruff
 	$(BIN)/ruff check .

@@ -47,13 +47,15 @@ class NIRCIntegrator(CacheIntegrator):
             )
 
     def use_cache(self, cache) -> None:
-        """Train and ask `cache` from now on; it starts anew. An :class:`~mi_neural.caches.incident.IncidentCache`, or one
-        of a class of your own that derives from it, see :mod:`mi_neural.caches.arrays`. Raises ValueError for another,
-        and with termination ``auto``, which has two of its own."""
-        self._check(self.termination != "auto", "use_cache() does not work with termination 'auto', which has two caches "
-                    "of its own")  # fmt: skip
-        self._check(isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache),
-                    f"use_cache() takes an IncidentCache or a class derived from it; got {type(cache).__name__}")  # fmt: skip
+        """Train and ask `cache` from now on; it starts anew.
+
+        An :class:`~mi_neural.caches.incident.IncidentCache`, or one of a class of your own that derives from it, see
+        :mod:`mi_neural.caches.arrays`. Raises ValueError for another, and with termination ``auto``, which has two.
+        """
+        self._check(self.termination != "auto", "termination 'auto' has two caches of its own; use_cache() takes one")
+        fits = isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache)
+        self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
+                    f"{type(cache).__name__}")  # fmt: skip
         self.cache = cache
         self.state.passes.clear()
         self.reset()

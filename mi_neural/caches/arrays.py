@@ -1,9 +1,8 @@
 """Caches without a network: a few arrays, and any rule by which records change them.
 
-What an integrator asks is a *field*: a PyTree with ``encode(x, n)`` and ``query(features, w)``. How it is trained is the
-business of a cache, an :class:`~mi_neural.caches.incident.IncidentCache` or a class of one's own that derives from it
-and gives :meth:`~mi_neural.caches.incident.IncidentCache.make_field` and ``learn``. Hand it to an integrator by
-``integrator.use_cache(cache)``. Notebook 08 writes one from nothing.
+What an integrator asks is a *field*: a PyTree with ``encode(x, n)`` and ``query(features, w)``. How it is trained is
+the business of a cache: an :class:`~mi_neural.caches.incident.IncidentCache`, or a class of one's own that derives from
+it and gives ``make_field`` and ``learn``. ``nirc`` takes one by ``use_cache(cache)``; notebook 08 writes one.
 """
 
 from __future__ import annotations

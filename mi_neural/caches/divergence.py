@@ -25,8 +25,10 @@ class StepWatch:
         self.known = [_network(o) for o in optimizers]
 
     def step(self, *optimizers) -> float:
-        """Length of the step since `begin`, over that of the weights before it; NaN where they are not finite, 0 without
-        an optimiser."""
+        """Length of the step since `begin`, over that of the weights before it.
+
+        NaN where they are not finite, 0 without an optimiser.
+        """
         with np.errstate(all="ignore"):
             moved = [np.linalg.norm(_network(o) - w) for o, w in zip(optimizers, self.known, strict=True)]
             shares = [m / max(np.linalg.norm(w), 1e-30) for m, w in zip(moved, self.known, strict=True)]

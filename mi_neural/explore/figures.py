@@ -1,8 +1,8 @@
 """Figures for notebooks and reports: pictures side by side, maps, curves.
 
 Each function gives a :class:`Drawing`: a notebook shows it, ``save`` writes it, ``figure`` is the matplotlib figure to
-go on with. Nothing global is touched, neither matplotlib's backend nor its styles. Pictures of many colours are embedded
-as JPEG and the rest as PNG, so that a notebook stays small.
+go on with. Nothing global is touched, neither matplotlib's backend nor its styles. Pictures of many colours are
+embedded as JPEG and the rest as PNG, so that a notebook stays small.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import NullFormatter
 
 from mi_neural.measure import exr
 
@@ -38,7 +40,7 @@ class Drawing:
     def data(self, kind: str | None = None) -> bytes:
         """The figure as a PNG or JPEG file."""
         buffer, kind = io.BytesIO(), kind or self.kind
-        options = {"pil_kwargs": {"quality": 88}} if kind in ("jpeg", "jpg") else {}
+        options = {"pil_kwargs": {"quality": 85}} if kind in ("jpeg", "jpg") else {}
         FigureCanvasAgg(self.figure)
         self.figure.savefig(buffer, format=kind, dpi=DPI, **options)
         return buffer.getvalue()
@@ -56,15 +58,16 @@ class Drawing:
 
 def pictures(
     images: Mapping[str, np.ndarray], *, notes: Mapping[str, str] | None = None, exposure: float | None = None,
-    columns: int | None = None, marks: Sequence[tuple[float, float]] = (), width: float = WIDTH,
+    columns: int | None = None, marks: Sequence[tuple[float, float]] = (), disk: bool = False, width: float = WIDTH,
 ) -> Drawing:  # fmt: skip
     """Renderings side by side, all at one exposure.
 
-    images    title -> linear RGB, shape (height, width, 3). Pixels that are NaN in all channels are left white
+    images    title -> linear RGB, shape (height, width, 3)
     notes     title -> a second line
     exposure  in stops; default: the mean of the last picture at middle grey
     columns   pictures in a row; default: all of up to four
     marks     points (x, y) in pixels, marked by numbers in each picture
+    disk      cut out the disk in each: directions above a point (:class:`~mi_neural.explore.views.Hemisphere`)
 
     Raises ``ValueError`` without an image, or for one that is not of such a shape.
     """
@@ -75,9 +78,10 @@ def pictures(
         exposure = exr.automatic_exposure(list(arrays.values())[-1])
     figure, places = _grid(arrays, notes or {}, columns, width)
     for axes, image in zip(places, arrays.values(), strict=True):
-        shown = exr.to_srgb8(image, exposure)
-        shown[np.isnan(image).all(axis=-1)] = 255
-        axes.imshow(shown, interpolation="nearest" if image.shape[1] < 160 else "antialiased")
+        drawn = axes.imshow(exr.to_srgb8(image, exposure), interpolation="nearest" if image.shape[1] < 160 else None)
+        if disk:
+            drawn.set_clip_path(Circle((0.5, 0.5), 0.5, transform=axes.transAxes))
+            axes.patch.set_visible(False)
         for k, (x, y) in enumerate(marks):
             axes.plot(x, y, "o", markersize=11, markerfacecolor="white", markeredgecolor="black", alpha=0.85)
             axes.annotate(str(k + 1), (x, y), ha="center", va="center_baseline", fontsize=8)
@@ -146,6 +150,7 @@ def curves(
     axes.set(xlabel=x, ylabel=y, title=title)
     if "x" in log:
         axes.set_xscale("log")
+        axes.xaxis.set_minor_formatter(NullFormatter())
     if "y" in log:
         axes.set_yscale("log")
     axes.grid(True, which="major", alpha=0.3)
