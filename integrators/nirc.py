@@ -47,7 +47,7 @@ class NIRCIntegrator(CacheIntegrator):
             )
 
     def use_cache(self, cache) -> None:
-        """Train and ask `cache` from now on; it starts anew.
+        """Train and ask `cache` from now on; it starts anew, with the constants of training that it was made with.
 
         An :class:`~mi_neural.caches.incident.IncidentCache`, or one of a class of your own that derives from it, see
         :mod:`mi_neural.caches.arrays`. Raises ValueError for another, and with termination ``auto``, which has two.

@@ -80,7 +80,7 @@ def pictures(
     for axes, image in zip(places, arrays.values(), strict=True):
         drawn = axes.imshow(exr.to_srgb8(image, exposure), interpolation="nearest" if image.shape[1] < 160 else None)
         if disk:
-            drawn.set_clip_path(Circle((0.5, 0.5), 0.5, transform=axes.transAxes))
+            drawn.set_clip_path(Circle((0.5, 0.5), 0.49, transform=axes.transAxes))
             axes.patch.set_visible(False)
         for k, (x, y) in enumerate(marks):
             axes.plot(x, y, "o", markersize=11, markerfacecolor="white", markeredgecolor="black", alpha=0.85)
