@@ -6,7 +6,8 @@ import numpy as np
 
 from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
-from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.incident import IncidentCache
+from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
 from mi_neural.caches.pair import PairCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
@@ -87,6 +88,20 @@ class NIRCIntegrator(CacheIntegrator):
     @property
     def caches(self) -> tuple[str, ...]:
         return ("outgoing", "incident") if self.termination == "auto" else ("incident",)
+
+    def use_cache(self, cache) -> None:
+        """Train and ask `cache` from now on; it starts anew, with the constants of training that it was made with.
+
+        An :class:`~mi_neural.caches.incident.IncidentCache`, or one of a class of your own that derives from it, see
+        :mod:`mi_neural.caches.arrays`. Raises ValueError for another, and with termination ``auto``, which has two.
+        """
+        self._check(self.termination != "auto", "termination 'auto' has two caches of its own; use_cache() takes one")
+        fits = isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache)
+        self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
+                    f"{type(cache).__name__}")  # fmt: skip
+        self.cache = cache
+        self.state.passes.clear()
+        self.reset()
 
     @property
     def needs_cache(self) -> bool:

@@ -235,13 +235,17 @@ class IncidentCache:
         with dr.suspend_grad():
             records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
             dr.eval(records, n_bad)
-        outputs = self._learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
-        sigma = mi.Float(0) if isinstance(cache, TrainedField) else cache.mean_sigma()
+        outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
+        sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
         return *outputs, dr.count(records.valid), n_bad, sigma
 
-    def _learn(self, cache, records: TrainingRecords, seed, learning_rate, decay):
-        """One step on the given records; see :func:`learn`."""
-        return learn(cache, records, self.training, seed, learning_rate, decay)
+    def make_field(self, low: list, high: list, scale: float):
+        """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""
+        return self.FIELD(low, high, self.shape, scale=scale, seed=self.seed)
+
+    def learn(self, asked, records: TrainingRecords, seed, learning_rate, decay) -> tuple:
+        """One training step of what is `asked` on the records; is frozen. See :func:`learn` for what it returns."""
+        return learn(asked, records, self.training, seed, learning_rate, decay)
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -258,7 +262,7 @@ class IncidentCache:
             scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-30):
             scale = 1e-20  # no indirect light found: the cache answers with nothing
-        self.field = self.FIELD(low, high, self.shape, scale=scale, seed=self.seed)
+        self.field = self.make_field(low, high, scale)
         dr.eval(self.field)
 
     def train_frame(self, scene, sensor, lights=None) -> float:
