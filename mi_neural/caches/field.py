@@ -259,6 +259,8 @@ class TrainedField:
     #: Arrays beside the weights that training changes, as paths of attributes; those of `UNKNOWN` may hold NaN.
     BESIDE: tuple[str, ...] = ()
     UNKNOWN: tuple[str, ...] = ()
+    #: What one set of its weights is.
+    WEIGHTS: type
 
     shape: FieldShape
     current: Weights
@@ -413,7 +415,7 @@ class Field(TrainedField):
     is a view of them for queries, brought up to date by :meth:`sync`.
     """
 
-    KIND = "incident"
+    KIND, WEIGHTS = "incident", Weights
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
         "scale": object, "mean": object,
@@ -435,8 +437,8 @@ class Field(TrainedField):
 
     def reset(self) -> None:
         """Start anew: the weights and the optimiser as they were when the field was made, bit for bit."""
-        self.current = Weights(self.shape, self.seed)
-        self.averaged = Weights(self.shape, self.seed)
+        self.current = self.WEIGHTS(self.shape, self.seed)
+        self.averaged = self.WEIGHTS(self.shape, self.seed)
         self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
         self._attach_optimizer()
         self.steps = 0

@@ -23,7 +23,7 @@ from ..transport.samples import PathSampler
 from . import encoding, loss
 from .blend import Blend
 from .divergence import StepWatch, healthy
-from .field import Field, FieldShape
+from .field import Field, FieldShape, TrainedField
 from .reliability import Reliability
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
@@ -171,8 +171,8 @@ class IncidentCache:
     BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
-    #: What is trained, and what blends its two sets of weights.
-    FIELD, BLEND = Field, Blend
+    #: What is trained, its sizes, and what blends its two sets of weights.
+    FIELD, SHAPE, BLEND = Field, FieldShape, Blend
     #: What the mean weight of the blend is called in the statistics.
     MEASURE = "reliability"
 
@@ -180,7 +180,7 @@ class IncidentCache:
         self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0, *, blend: str = "ema",
         reliability: Reliability | None = None,
     ):  # fmt: skip
-        self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
+        self.training, self.shape, self.seed = training or Training(), shape or self.SHAPE(), seed
         self.blend, self.reliability = blend, reliability
         self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
         self._probe = dr.freeze(self._probe_plain, auto_opaque=False)
@@ -235,9 +235,17 @@ class IncidentCache:
         with dr.suspend_grad():
             records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
             dr.eval(records, n_bad)
-        outputs = learn(cache, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
-        sigma = mi.Float(0) if isinstance(cache, Field) else cache.mean_sigma()
+        outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
+        sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
         return *outputs, dr.count(records.valid), n_bad, sigma
+
+    def make_field(self, low: list, high: list, scale: float):
+        """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""
+        return self.FIELD(low, high, self.shape, scale=scale, seed=self.seed)
+
+    def learn(self, asked, records: TrainingRecords, seed, learning_rate, decay) -> tuple:
+        """One training step of what is `asked` on the records; is frozen. See :func:`learn` for what it returns."""
+        return learn(asked, records, self.training, seed, learning_rate, decay)
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -254,7 +262,7 @@ class IncidentCache:
             scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-30):
             scale = 1e-20  # no indirect light found: the cache answers with nothing
-        self.field = Field(low, high, self.shape, scale=scale, seed=self.seed)
+        self.field = self.make_field(low, high, scale)
         dr.eval(self.field)
 
     def train_frame(self, scene, sensor, lights=None) -> float:

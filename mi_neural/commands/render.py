@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, repeats, terminal
+from mi_neural.measure import benchmark, budget, cluster, denoise, environment, exr, jobs, load, repeats, terminal
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
@@ -42,13 +42,17 @@ def render(
     save_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what was learned")] = None,
     load_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="start from what was learned")] = None,
     json_: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="write the facts")] = None,
+    scheduler: options.Scheduler = None,
 ) -> None:
     """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute.
 
+    With --scheduler the cache is trained here, and the workers render the samples.
     Where a cache trains for long, a first image of one sample a pixel is written after a second of it.
     """
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")
+    if scheduler is not None and seconds is not None:
+        raise InputError("--seconds is time of this process; with --scheduler give --spp")
     terminal.positive("--spp", spp)
     terminal.positive("--seconds", seconds)
     if pretrain < 0:
@@ -114,17 +118,20 @@ def render(
 
         return advance
 
-    with terminal.Bars() as bars:
+    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
         if denoise_:
             bars("guides for the denoiser")
             guides = denoise.render_guides(loaded.scene, seed)
             denoise.warm_up(guides)
-        bars("compiling")
         n = spp or loaded.default_spp
-        sizes = budget.pass_sizes(loaded.scene) if seconds else sorted(set(budget.plan_passes(loaded.scene, n)))
-        if seconds is None and not hasattr(case.integrator, "prepare"):
-            sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
-        case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
+        if workers is None:
+            bars("compiling")
+            sizes = budget.pass_sizes(loaded.scene) if seconds else sorted(set(budget.plan_passes(loaded.scene, n)))
+            if seconds is None and not hasattr(case.integrator, "prepare"):
+                sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
+            case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
+        else:
+            cluster.check(case)
         if load_cache is not None:
             case.integrator.load_cache(str(load_cache))
         bars_pretrain = bars(f"training {pretrain} frames") if pretrain else None
@@ -146,6 +153,10 @@ def render(
                 pretrained=bool(pretrain or load_cache),
                 keep=keep,
             )
+        elif workers is not None:
+            setup = jobs.Setup.of(loaded, case, wanted_size, own=spec is None)
+            bar = bars(f"rendering {n} samples a pixel on {terminal.counted(workers.count(), 'worker')}")
+            rendered = cluster.render_samples(setup, loaded, case, n, seed, workers, progress=bar, keep=keep)
         else:
             rendered = budget.render_samples(
                 loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
@@ -167,5 +178,7 @@ def render(
     terminal.print_rows(repeats.group([row]))
     first = f"first image {row.seconds_to_first_image:.1f} s after the start"
     terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
+    if rendered.problem:
+        raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {n} samples a pixel")
     if rendered.interrupted:
         raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")
