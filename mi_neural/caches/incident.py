@@ -23,7 +23,7 @@ from ..transport.samples import PathSampler
 from . import encoding, loss
 from .blend import Blend
 from .divergence import StepWatch, healthy
-from .field import Field, FieldShape, TrainedField
+from .field import Field, FieldShape
 from .reliability import Reliability
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).

@@ -78,6 +78,10 @@ class HarmonicWeights:
     def assign(self, parameters) -> None:
         self.grid.data = parameters["grid"]
 
+    def finite(self):
+        """Whether all coefficients are, 1-wide."""
+        return dr.isfinite(dr.sum(dr.detach(self.grid.data)))
+
     def pack(self) -> None:
         """Queries read the grid itself."""
 

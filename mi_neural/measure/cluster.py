@@ -175,8 +175,8 @@ class Workers:
         """Run jobs, each with its data (None: without; one object is sent once, for however many jobs).
 
         Yields (index, answer) as they are done, in any order; a job that failed gives its error. A job whose worker
-        dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun. Raises
-        :class:`ClusterError`: a job took several workers with it, no worker or no scheduler is there any more.
+        dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun.
+        Raises :class:`ClusterError`: a job took several workers with it, no worker or no scheduler is there any more.
         """
         waiting, finished, call = deque(range(len(jobs_and_data))), queue.SimpleQueue(), _by_value()
         running: dict[object, tuple[int, str]] = {}  # future -> job, worker
