@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
@@ -303,6 +304,16 @@ class CacheIntegrator(mi.SamplingIntegrator):
             self.state.image_open = False
         self.state.planned_spp = spp
 
+    @contextmanager
+    def previewing(self):
+        """Inside, images show what has been learned so far: they train nothing and count for nothing."""
+        known = self.state.images, self.state.queries, self.state.image_open
+        self.state.image_open = True
+        try:
+            yield
+        finally:
+            self.state.images, self.state.queries, self.state.image_open = known
+
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. What was learned so far stays as it is."""
         sensor = self._sensor(scene, sensor)
@@ -347,7 +358,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             s["ns_per_query"] = self.state.ns_per_query
         return s
 
-    def measure_query(self, n: int = 2**18) -> float:
+    def measure_query(self, n: int = 2**16) -> float:
         """Nanoseconds per cache query, as :meth:`probe` asks it. Also kept for :meth:`statistics`."""
         field = self.cache.asked
         if field is None:
@@ -365,7 +376,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             for k in range(7):
                 dr.sync_thread()
                 t0 = time.perf_counter()
-                dr.eval(run(field, mi.UInt32(k)))
+                dr.eval(run(field, dr.opaque(mi.UInt32, k)))
                 dr.sync_thread()
                 times.append(time.perf_counter() - t0)
         self.state.ns_per_query = float(np.median(times[2:])) / (n * self.PROBES) * 1e9

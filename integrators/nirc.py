@@ -6,7 +6,8 @@ import numpy as np
 
 from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
-from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.incident import IncidentCache
+from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
 from mi_neural.caches.pair import PairCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
@@ -88,6 +89,22 @@ class NIRCIntegrator(CacheIntegrator):
     def caches(self) -> tuple[str, ...]:
         return ("outgoing", "incident") if self.termination == "auto" else ("incident",)
 
+    def use_cache(self, cache) -> None:
+        """Train and ask `cache` from now on; it starts anew, with the constants of training that it was made with.
+
+        An :class:`~mi_neural.caches.incident.IncidentCache`, or one of a class of your own that derives from it, see
+        :mod:`mi_neural.caches.arrays`. Raises ValueError for another, and with termination ``auto``, which has two.
+        """
+        self._check(self.termination != "auto", "termination 'auto' has two caches of its own; use_cache() takes one")
+        fits = isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache)
+        self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
+                    f"{type(cache).__name__}")  # fmt: skip
+        self.cache = cache
+        self.given["cache"] = type(cache).__name__
+        self.state.plan = None
+        self.state.passes.clear()
+        self.reset()
+
     @property
     def needs_cache(self) -> bool:
         return super().needs_cache and self.cache_samples > 0
@@ -128,6 +145,7 @@ class NIRCIntegrator(CacheIntegrator):
         _, mean, square, sampler = dr.while_loop(
             (mi.UInt32(0), mi.Float(0), mi.Float(0), sampler), lambda k, *_: k < 4, once
         )
+        dr.eval(mean, square, L)  # one kernel, not one for each
         variance = np.array(dr.maximum(square - dr.square(mean), 0)) * (4 / 3)
         # Relative to the brightness of the place, the scene's mean being its floor
         level = float(np.mean(np.array(mean + dr.mean(L))))

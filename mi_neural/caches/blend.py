@@ -71,7 +71,7 @@ class Blend:
         """What depends on the position alone, of either predictor where it counts."""
         if self.grid is None:
             return None, None, self.field.features(self.fast, x)
-        sigma, n_values = self.sigma(x, n), self.field.shape.n_features_total
+        sigma, n_values = self.sigma(x, n), self.field.shape.n_encoded
         return sigma, *(
             where_active(asks, (mi.Point3f(x),), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
             for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))

@@ -68,7 +68,7 @@ class ControlVariate:
         if active is True:
             return self.field.encode(x)
         return list(where_active(active, (mi.Point3f(x),), lambda x: tuple(self.field.encode(x)),
-                                 self.field.shape.n_features_total))  # fmt: skip
+                                 self.field.shape.n_encoded))  # fmt: skip
 
     def query(self, features: list, w, active=True):
         """Radiance from direction `w` at the encoded position, in [0, 1e4 scale]."""

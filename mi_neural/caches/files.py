@@ -75,7 +75,7 @@ def read(path, kind: str, unknown: tuple[str, ...] = ()) -> tuple[dict, dict[str
             f"'{path}' has cache format {version}, this version reads {FILE_VERSION}; train and save it again"
         )
     if found != kind:
-        raise CacheFileError(f"'{path}' {KINDS[kind]}")
+        raise CacheFileError(f"'{path}' {KINDS.get(kind, f'holds no cache of the kind {kind!r}')}")
     if {name: list(values.shape) for name, values in arrays.items()} != header.get("arrays"):
         raise damaged(path, "its arrays are not those that its header says")
     for name, values in arrays.items():

@@ -81,6 +81,10 @@ class OutgoingShape(FieldShape):
         sizes = dict(zip(INPUTS, (*directions, 3, ROUGHNESS_BINS), strict=True))
         return self.n_levels * self.n_features + sum(sizes[name] for name in self.inputs)
 
+    @property
+    def n_first(self) -> int:
+        return self.n_inputs  # every query is at another point
+
 
 def reflectance(albedo):
     """The factor that is taken out of the targets and multiplied back at queries."""
@@ -216,11 +220,8 @@ class OutgoingField(TrainedField):
 
     def predict(self, x, n, w, albedo, roughness):
         """What :meth:`raw` gives for the weights being trained, differentiable with respect to them."""
-        self.current.assign(self.optimizer)
-        width = dr.width((x, n, w, albedo, roughness))
-        inputs = [i + dr.zeros(mi.Float, width) for i in self._encode(self.current, x, n, w, albedo, roughness)]
-        out = self.current.mlp(mi.TensorXf(dr.concat(inputs), shape=(self.shape.n_inputs, width)))
-        return mi.Color3f(*(out[i, :].array for i in range(3))) + 1
+        weights = self.trainable()
+        return mi.Color3f(*weights.differentiable(self._encode(weights, x, n, w, albedo, roughness))) + 1
 
     def learn(
         self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,
@@ -257,24 +258,25 @@ class OutgoingField(TrainedField):
             dr.eval(usable, n_bad, x, n, w, albedo, roughness, y, share, able, scale, mean_target)
 
         p = self.predict(x, n, w, albedo, roughness)
+        said = dr.detach(p)
+        dr.schedule(said)
         if watch is not None:
             with dr.suspend_grad():
-                watch(y * scale, dr.maximum(dr.detach(p), 0) * scale, usable)
-        error = dr.sum(dr.select(usable, loss.relative_l2(p, y, epsilon), 0)) * share
-        error = dr.select(able, error, math.nan)
-        mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(dr.detach(p))), 0)) * share
-        dr.schedule(mean_prediction)
-
-        learned = dr.isfinite(dr.detach(error))
-        moves = learned & (smoothing < 1)
+                watch(y * scale, dr.maximum(said, 0) * scale, usable)
+        errors = dr.select(usable, loss.relative_l2(p, y, epsilon), 0) * share
+        errors = dr.select(able, errors, math.nan)
         eta = smoothing * self.eta + (1 - smoothing)
         decay = dr.select(smoothing < 1, smoothing * self.eta / dr.maximum(eta, 1e-30), 1)
-        self.averaged.assign(descend(self.optimizer, error, self.averaged.parameters(), learning_rate, decay))
+        averaged, error = descend(self.optimizer, errors, self.averaged.parameters(), learning_rate, decay)
+        self.averaged.assign(averaged)
         self.averaged.pack()
+        learned = dr.isfinite(error)
+        moves = learned & (smoothing < 1)
+        mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(said)), 0)) * share
         self.eta = dr.select(moves, eta, self.eta)
         self.scale = dr.select(moves, scale, self.scale)
         dr.eval(self.averaged, self.eta, self.scale)
-        return dr.detach(error), mean_target, mean_prediction, n_bad
+        return error, mean_target, mean_prediction, n_bad
 
     # -------------------------------------------------------------------------------------------------------------
     # Where records lie

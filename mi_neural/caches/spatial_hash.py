@@ -55,7 +55,7 @@ class HashShape:
             raise ValueError(f"prior is {self.prior}; it must be greater than 0")
 
     @property
-    def n_features_total(self) -> int:
+    def n_encoded(self) -> int:
         """Values that the encoding of a position has: one cell a level."""
         return self.n_levels
 
@@ -209,19 +209,19 @@ class SpatialHashCache(IncidentCache):
 
     FIELD, SHAPE = SpatialHash, HashShape
 
-    def _learn(self, cache: SpatialHash, records, seed, learning_rate, decay):
+    def learn(self, asked: SpatialHash, records, seed, learning_rate, decay):
         """Add the records. The loss, of what was known before them, is relative to the mean target; it steers nothing
         but when training counts as settled."""
         with dr.suspend_grad():
             n_valid = dr.maximum(dr.count(records.valid), 1)
-            y = dr.select(records.valid, dr.clip(records.target / cache.scale, 0, TARGET_MAX), 0)
-            p = cache.raw(cache.encode(records.position), records.direction)
+            y = dr.select(records.valid, dr.clip(records.target / asked.scale, 0, TARGET_MAX), 0)
+            p = asked.raw(asked.encode(records.position), records.direction)
             error = dr.select(records.valid, loss.relative_l2(p, y, self.training.epsilon), 0)
             level, said = (dr.select(records.valid, loss.luminance(v), 0) for v in (y, p))
             dr.eval(y, error, level, said)
             outputs = [dr.sum(v) / n_valid for v in (error, level, said)]
-            cache.mean = dr.lerp(outputs[1], cache.mean, decay)
+            asked.mean = dr.lerp(outputs[1], asked.mean, decay)
             kept = 1 - (1 - decay) / MEMORY
-            cache.add(records.position, records.direction, y, records.valid, kept)
-            dr.eval(outputs, cache.mean)
+            asked.add(records.position, records.direction, y, records.valid, kept)
+            dr.eval(outputs, asked.mean)
         return tuple(outputs)
