@@ -100,6 +100,8 @@ class NIRCIntegrator(CacheIntegrator):
         self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
                     f"{type(cache).__name__}")  # fmt: skip
         self.cache = cache
+        self.given["cache"] = type(cache).__name__
+        self.state.plan = None
         self.state.passes.clear()
         self.reset()
 

@@ -16,7 +16,8 @@ SIZES = {"levels": "n_levels", "hashmap_size": "hashmap_size", "width": "width",
 def make_plan(integrator, scene, sensor) -> plan.ScenePlan:
     """The plan of an integrator in a scene, that of its light sampler included. Changes neither."""
     facts = plan.SceneFacts.read(scene, sensor)
-    default = type(integrator.cache.shape)()
+    cache = integrator.cache
+    default = cache.SHAPE() if isinstance(cache.shape, cache.SHAPE) else None  # None: a cache of the user's own
     request = plan.Request(
         integrator.plugin, integrator.plan_mode, integrator.given, integrator.caches, integrator.max_depth,
         integrator.cache.blend, {key: getattr(default, name) for key, name in SIZES.items() if hasattr(default, name)},

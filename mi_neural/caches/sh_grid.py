@@ -48,14 +48,14 @@ class HarmonicShape:
         return (self.degree + 1) ** 2
 
     @property
-    def n_features_total(self) -> int:
+    def n_encoded(self) -> int:
         """Values that the encoding of a position has: coefficients of three colours."""
         return 3 * self.n_harmonics
 
     @property
     def n_stored(self) -> int:
         """Numbers of an entry: the coefficients, made even."""
-        return self.n_features_total + self.n_features_total % 2
+        return self.n_encoded + self.n_encoded % 2
 
 
 class HarmonicWeights:
@@ -96,7 +96,7 @@ class HarmonicField(Field):
 
     def features(self, weights: HarmonicWeights, x) -> list:
         values = list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
-        levels = [values[k :: self.shape.n_stored] for k in range(self.shape.n_features_total)]
+        levels = [values[k :: self.shape.n_stored] for k in range(self.shape.n_encoded)]
         return [sum(level[1:], level[0]) for level in levels]
 
     def output(self, weights: HarmonicWeights, features: list, w):
@@ -107,8 +107,8 @@ class HarmonicField(Field):
         ))  # fmt: skip
 
     def predict(self, x, w):
-        self.current.assign(self.optimizer)
-        return self.raw(self.encode(x, averaged=False), w, averaged=False)
+        weights = self.trainable()
+        return self.output(weights, self.features(weights, x), w)
 
     @classmethod
     def make(cls, constants: dict) -> HarmonicField:

@@ -55,7 +55,7 @@ class HashShape:
             raise ValueError(f"prior is {self.prior}; it must be greater than 0")
 
     @property
-    def n_features_total(self) -> int:
+    def n_encoded(self) -> int:
         """Values that the encoding of a position has: one cell a level."""
         return self.n_levels
 
