@@ -46,8 +46,9 @@ def write(folder: Path, compact: Path | None = None, animation: Path | None = No
             section, frames = _sequence(results.parent, found, folder)
             moving.append(frames)
         else:
-            section, pictures = _comparison(results.parent, found, folder)
-            sheet.append(pictures)
+            shown = [_comparison(results.parent, found, k, folder) for k in range(len(found["scenes"]))]
+            sheet += [pictures for _, pictures in shown]
+            section = "\n".join(text for text, _ in shown)
         sections.append(section)
     if not sections:
         raise InputError(f"{folder} holds no results of compare or sequence: run them with -o {folder}/NAME")
@@ -69,9 +70,12 @@ def _folders(folder: Path) -> list[str]:
 # Comparisons
 
 
-def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.ndarray]]:
-    """The section of a comparison, and its pictures in uint8."""
-    reference = exr.read(_reference_path(folder, found)).rgb
+def _comparison(folder: Path, found: dict, k: int, root: Path) -> tuple[str, list[np.ndarray]]:
+    """The section of scene number `k` of a comparison, and its pictures in uint8."""
+    scene, several = found["scenes"][k], len(found["scenes"]) > 1
+    report = folder.relative_to(root) / "report.html"
+    folder = folder / scene["scene"] if several else folder
+    reference = exr.read(_reference_path(folder, scene)).rgb
     exposure = exr.automatic_exposure(reference)
     exr.write_png(folder / "reference.png", reference, exposure)
     name = folder.relative_to(root)
@@ -79,7 +83,8 @@ def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.nda
     pictures = [exr.to_srgb8(reference, exposure)]
     seen = set()
     for row in found["rows"]:
-        if not row["image"] or row["denoised"] or row["mode"] == "sample" or row["label"] in seen:
+        shows = row["scene"] == scene["scene"] and row["image"] and not row["denoised"] and row["mode"] != "sample"
+        if not shows or row["label"] in seen:
             continue
         seen.add(row["label"])
         rgb = exr.read(folder / row["image"]).rgb
@@ -89,19 +94,18 @@ def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.nda
         exr.write_bytes(folder / f"{stem}_flip.png", exr.png_bytes(flip_colours(error.map)))
         pictures.append(exr.to_srgb8(rgb, exposure))
         shown = [name / f"{stem}.png", name / f"{stem}_flip.png"]
-        figures.append(_figure(shown, _caption(row), command_of(row, found)))
-    width, height = found["size"]
-    title = f"{found['scene']}, {width}x{height}"
-    more = f'<p><a href="{name}/report.html">report</a> <code>{html.escape(found["command"])}</code></p>'
+        figures.append(_figure(shown, _caption(row), command_of(row, found["command"])))
+    width, height = scene["size"]
+    title = f"{scene['scene']}, {width}x{height}"
+    more = f'<p><a href="{report.as_posix()}">report</a> <code>{html.escape(found["command"])}</code></p>'
     return f'<h2>{html.escape(title)}</h2>\n{more}\n<div class="row">{"".join(figures)}</div>', pictures
 
 
-def _reference_path(folder: Path, found: dict) -> Path:
-    given = found.get("reference")
-    if not given:
-        raise InputError(f"{folder} was made without a reference; a gallery shows errors against one")
-    path = Path(given["path"])
-    return path if path.is_file() else folder / path.name
+def _reference_path(folder: Path, scene: dict) -> Path:
+    path = Path(scene["reference"]["path"])
+    if not path.is_file():
+        raise InputError(f"the reference of {folder}, {path}, is gone: run its mi-neural compare again")
+    return path
 
 
 def _caption(row: dict) -> str:
@@ -115,12 +119,12 @@ def _caption(row: dict) -> str:
     return f"<b>{html.escape(row['label'])}</b><br>{', '.join(cost)}<br>{', '.join(errors)}"
 
 
-def command_of(row: dict, found: dict) -> str:
-    """The command that renders such a picture as a row's."""
-    scene = shlex.split(found["command"])[2]  # mi-neural compare SCENE ..., or --scenes FOLDER
-    words = ["mi-neural", "render", found["scene"] if scene.startswith("-") else scene, "-i", row["label"]]
+def command_of(row: dict, command: str) -> str:
+    """The command that renders such a picture as that of a row which `command` made."""
+    given = [word for word in shlex.split(command)[2:] if Path(word).stem == row["scene"]]
+    words = ["mi-neural", "render", *(given[:1] or [row["scene"]]), "-i", row["label"]]
     width, height = row["size"]
-    words += [*_defines(found["command"]), "--size", f"{width}x{height}"]
+    words += [*_defines(command), "--size", f"{width}x{height}"]
     words += ["--pretrain", str(row["pretrain_frames"])] if row["pretrain_frames"] else []
     words += ["--seconds", f"{row['budget_seconds']:g}"] if row["budget_seconds"] else ["--spp", f"{row['spp']:g}"]
     return shlex.join([*words, "-o", "picture.png"])
