@@ -26,7 +26,8 @@ def results(tmp_path):
         image = label.replace(":", "_") + ".exr"
         exr.write(done / image, reference + error)
         rows.append({
-            "scene": "box", "label": label, "image": image, "mode": "steady", "denoised": False, "size": [12, 8], "spp": 3.0,
+            "scene": "box", "label": label, "image": image, "mode": "steady", "denoised": False, "size": [12, 8],
+            "spp": 3.0,
             "budget_seconds": 0.25, "pretrain_frames": 200, "seconds_pretrain": 4.0, "seconds_train": 0.03,
             "seconds_render": 0.2, "relmse_trimmed": error, "flip": error,
         })  # fmt: skip
@@ -39,10 +40,11 @@ def results(tmp_path):
     moving = tmp_path / "2_moving"
     for case in ("path", "nirc"):
         (moving / case).mkdir(parents=True)
-        (moving / case / "frames.jsonl").write_text("")
         for k in range(3):
             exr.write(moving / case / f"frame_{k:04d}.exr", np.full((8, 8, 3), 0.1 * (k + 1)))
-    (moving / "results.json").write_text(json.dumps({"scene": "box", "command": "mi-neural sequence box.xml -o x"}))
+    cases = [{"label": name, "folder": name, "rows": [{}] * 3} for name in ("path", "nirc")]
+    found = {"scene": "box", "command": "mi-neural sequence box.xml -o x", "cases": cases}
+    (moving / "results.json").write_text(json.dumps(found))
     return tmp_path
 
 

@@ -24,14 +24,14 @@ from .report import number
 from .sequence import frame_path
 
 #: Frames a second of animations, and what WebP may lose (100: nothing).
-RATE, QUALITY = 12, 80
+RATE, QUALITY = 12, 60
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; color: #222 }
 h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin: 2.5rem 0 .3rem }
 .row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; width: 290px }
 img { width: 100%; display: block; image-rendering: pixelated } figure img + img { margin-top: 2px }
-figcaption { font-size: 13px; line-height: 1.4 } figcaption b { font-size: 14px }
+figcaption { font-size: 13px; line-height: 1.4 } figcaption b { font-size: 14px; overflow-wrap: anywhere }
 code { font: 11.5px/1.35 ui-monospace, monospace; color: #555; overflow-wrap: anywhere; user-select: all }
 .wide { width: 620px } a { color: #0b5cad }
 """
@@ -42,7 +42,7 @@ def write(folder: Path, compact: Path | None = None, animation: Path | None = No
     sections, sheet, moving = [], [], []
     for results in sorted(folder.glob("*/results.json")):
         found = json.loads(results.read_text(encoding="utf-8"))
-        if any((results.parent / name / "frames.jsonl").is_file() for name in _folders(results.parent)):
+        if "cases" in found:  # of a sequence
             section, frames = _sequence(results.parent, found, folder)
             moving.append(frames)
         else:
@@ -60,10 +60,6 @@ def write(folder: Path, compact: Path | None = None, animation: Path | None = No
         if not moving:
             raise InputError(f"{folder} holds no sequence: run mi-neural sequence with -o {folder}/NAME")
         write_animation(moving[0], animation)
-
-
-def _folders(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.is_dir())
 
 
 # ------------------------------------------------------------------------------------------------------------------
@@ -147,14 +143,14 @@ def _figure(pictures: list[Path], caption: str, command: str, wide: bool = False
 
 def _sequence(folder: Path, found: dict, root: Path) -> tuple[str, list[np.ndarray]]:
     """The section of a sequence, and its frames, all integrators side by side, in uint8."""
-    cases = [folder / name for name in _folders(folder) if (folder / name / "frames.jsonl").is_file()]
-    counts = [len(list(case.glob("frame_*.exr"))) for case in cases]
-    images = [[exr.read(frame_path(case, k)).rgb for case in cases] for k in range(min(counts))]
+    cases = found["cases"]
+    n_frames = min(len(case["rows"]) for case in cases)
+    images = [[exr.read(frame_path(folder / case["folder"], k)).rgb for case in cases] for k in range(n_frames)]
     exposure = exr.automatic_exposure(np.concatenate(images[0]))
     frames = [montage([exr.to_srgb8(image, exposure) for image in strip], len(cases)) for strip in images]
     write_animation(frames, folder / "frames.webp")
     name = folder.relative_to(root)
-    caption = "from the left: " + ", ".join(html.escape(case.name) for case in cases)
+    caption = "from the left: " + ", ".join(html.escape(case["label"]) for case in cases)
     figure = _figure([name / "frames.webp"], caption, found["command"], wide=True)
     more = f'<p><a href="{name}/report.html">report</a></p>'
     return f'<h2>{html.escape(found["scene"])}, {len(frames)} frames</h2>\n{more}\n{figure}', frames
