@@ -23,8 +23,8 @@ from .page import flip_colours
 from .report import number
 from .sequence import frame_path
 
-#: Frames a second of animations, and what WebP may lose (100: nothing).
-RATE, QUALITY = 12, 60
+#: Frames a second of animations; what WebP may lose of them and of sheets (100: nothing).
+RATE, MOVING_QUALITY, SHEET_QUALITY = 12, 60, 85
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; color: #222 }
@@ -162,7 +162,8 @@ def write_animation(frames: list[np.ndarray], path: Path) -> None:
 
     first, *others = (Image.fromarray(frame) for frame in frames)
     with exr.replacing(path) as temporary:
-        first.save(temporary, save_all=True, append_images=others, duration=1000 // RATE, loop=0, quality=QUALITY)
+        first.save(temporary, save_all=True, append_images=others, duration=1000 // RATE, loop=0,
+                   quality=MOVING_QUALITY)  # fmt: skip
 
 
 def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
@@ -178,7 +179,7 @@ def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
     width = max(strip.shape[1] for strip in strips)
     padded = [np.pad(s, ((0, 4), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]
     with exr.replacing(path) as temporary:
-        Image.fromarray(np.concatenate(padded)[:-4]).save(temporary, quality=QUALITY)
+        Image.fromarray(np.concatenate(padded)[:-4]).save(temporary, quality=SHEET_QUALITY)
 
 
 PAGE = """<!DOCTYPE html>
