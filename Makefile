@@ -7,7 +7,7 @@ STAMP  := $(VENV)/mi_neural.stamp
 TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture bench gallery gallery-pictures docs test stress lint clean
+.PHONY: help demo picture bench gallery gallery-pictures docs notebooks test stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -73,6 +73,11 @@ test: $(TESTS)  ## the default tests, a few minutes on two cores
 
 stress: $(TESTS)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
 	$(BIN)/python tests/stress.py -o out/stress
+
+notebooks: $(STAMP)  ## run all notebooks in full length and keep their outputs, minutes
+	$(BIN)/python -m pip install --quiet -e '.[denoise,notebooks]'
+	$(BIN)/jupyter nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
+	    --ExecutePreprocessor.timeout=900 notebooks/*.ipynb
 
 lint: $(TESTS)  ## ruff
 	$(BIN)/ruff check .

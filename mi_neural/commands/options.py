@@ -28,6 +28,11 @@ ReferenceFile = Annotated[
 ]
 Denoise = Annotated[bool, typer.Option("--denoise", help="Open Image Denoise with albedo and normals as guides")]
 
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="a Dask scheduler, like tcp://HOST:8786, whose workers do it; default: none"),
+]
+
 
 def readable(command: Callable) -> Callable:
     """Run a command so that what goes wrong is one line on stderr and an exit code."""

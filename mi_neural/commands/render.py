@@ -9,9 +9,12 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, budget, denoise, environment, exr, load, repeats, terminal
+from mi_neural.measure import benchmark, budget, cluster, denoise, environment, exr, jobs, load, repeats, terminal
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
+
+#: Seconds of training after which `render` writes a first image of one sample a pixel, to be replaced by the final one.
+PREVIEW_SECONDS = 1.0
 
 
 @options.readable
@@ -39,10 +42,17 @@ def render(
     save_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what was learned")] = None,
     load_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="start from what was learned")] = None,
     json_: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="write the facts")] = None,
+    scheduler: options.Scheduler = None,
 ) -> None:
-    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute."""
+    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute.
+
+    With --scheduler the cache is trained here, and the workers render the samples.
+    Where a cache trains for long, a first image of one sample a pixel is written after a second of it.
+    """
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")
+    if scheduler is not None and seconds is not None:
+        raise InputError("--seconds is time of this process; with --scheduler give --spp")
     terminal.positive("--spp", spp)
     terminal.positive("--seconds", seconds)
     if pretrain < 0:
@@ -75,7 +85,7 @@ def render(
     terminal.depth_notes(ref, loaded, [case])
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
-    seconds_pretrain = 0.0
+    seconds_pretrain, seconds_preview, first_image = 0.0, 0.0, None
 
     def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
         row = benchmark.make_row(
@@ -84,30 +94,51 @@ def render(
             environment=environment.describe(), budget_seconds=seconds, pretrain_frames=pretrain,
             seconds_pretrain=seconds_pretrain,
         )  # fmt: skip
-        row.image = str(output)
+        row.image, row.seconds_to_first_image = str(output), first_image or environment.seconds_since_start()
         return row
 
     def keep(so_far: budget.Rendered) -> None:
+        nonlocal first_image
         terminal.write_image(output, describe(so_far, so_far.rgb), so_far.rgb, so_far)
+        first_image = first_image or environment.seconds_since_start()
 
-    with terminal.Bars() as bars:
+    def previewed(progress: budget.Progress) -> budget.Progress:
+        """`progress` of training, which also writes a first image once that has gone on for a while."""
+        start = budget.clock()
+
+        def advance(done: float, total: float) -> None:
+            nonlocal seconds_preview
+            progress(done, total)
+            now = budget.clock()
+            if first_image is not None or done >= total or now - start < PREVIEW_SECONDS:
+                return
+            if (so_far := budget.preview(loaded.scene, case.integrator, seed)) is not None:
+                keep(so_far)
+            seconds_preview += budget.clock() - now
+
+        return advance
+
+    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
         if denoise_:
             bars("guides for the denoiser")
             guides = denoise.render_guides(loaded.scene, seed)
             denoise.warm_up(guides)
-        bars("compiling")
         n = spp or loaded.default_spp
-        sizes = budget.pass_sizes(loaded.scene) if seconds else sorted(set(budget.plan_passes(loaded.scene, n)))
-        if seconds is None and not hasattr(case.integrator, "prepare"):
-            sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
-        case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
+        if workers is None:
+            bars("compiling")
+            sizes = budget.pass_sizes(loaded.scene) if seconds else sorted(set(budget.plan_passes(loaded.scene, n)))
+            if seconds is None and not hasattr(case.integrator, "prepare"):
+                sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
+            case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
+        else:
+            cluster.check(case)
         if load_cache is not None:
             case.integrator.load_cache(str(load_cache))
         bars_pretrain = bars(f"training {pretrain} frames") if pretrain else None
         seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
         seconds_first = 0.0
         if seconds is None and not stopped:
-            bars_first = bars("training") if hasattr(case.integrator, "train_first") else None
+            bars_first = previewed(bars("training")) if hasattr(case.integrator, "train_first") else None
             seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
         if stopped:  # the image that can be had at once
             rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
@@ -122,11 +153,15 @@ def render(
                 pretrained=bool(pretrain or load_cache),
                 keep=keep,
             )
+        elif workers is not None:
+            setup = jobs.Setup.of(loaded, case, wanted_size, own=spec is None)
+            bar = bars(f"rendering {n} samples a pixel on {terminal.counted(workers.count(), 'worker')}")
+            rendered = cluster.render_samples(setup, loaded, case, n, seed, workers, progress=bar, keep=keep)
         else:
             rendered = budget.render_samples(
                 loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
             )
-        rendered.seconds_train += seconds_first
+        rendered.seconds_train += seconds_first - seconds_preview
         image, seconds_denoise = rendered.rgb, 0.0
         if denoise_:
             image, seconds_denoise = denoise.denoise(rendered.rgb, guides)
@@ -141,6 +176,9 @@ def render(
     if save_cache is not None:
         case.integrator.save_cache(str(save_cache))
     terminal.print_rows(repeats.group([row]))
-    terminal.out.print(f"wrote {output}", soft_wrap=True, markup=False)
+    first = f"first image {row.seconds_to_first_image:.1f} s after the start"
+    terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
+    if rendered.problem:
+        raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {n} samples a pixel")
     if rendered.interrupted:
         raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")

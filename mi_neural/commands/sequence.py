@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, changes, denoise, environment, load, plots, terminal
+from mi_neural.measure import benchmark, changes, cluster, denoise, environment, load, plots, terminal
 from mi_neural.measure import sequence as sequences
 from mi_neural.measure.load import InputError
 
@@ -54,10 +54,12 @@ def sequence(
     ] = None,
     denoise_: options.Denoise = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
+    scheduler: options.Scheduler = None,
 ) -> None:
     """SCENE changing from frame to frame: frames, error and flicker over time, crops, an animated preview.
 
-    Ctrl-C keeps what is done; the same command goes on from there.
+    Ctrl-C keeps what is done; the same command goes on from there. With --scheduler the workers render the frames, with
+    caches that are trained here before the first one (train_steps=0); references are rendered here.
     """
     if output is None:
         raise InputError("sequence needs a folder for its results: add -o DIR")
@@ -91,22 +93,33 @@ def sequence(
         f"{', '.join(s.label for s in specs)}, {variant}"
     )
 
-    interrupted, notes = False, []
-    with terminal.Bars() as bars:
+    interrupted, problem, notes = False, "", []
+    plan = sequences.Plan(spp, pretrain, seed, denoise_)
+    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
+        elsewhere = None
+        if workers is not None:
+            for case in cases:
+                cluster.check(case, over_time=True)
+            workers.count()  # waits for the first
+            elsewhere = cluster.frames_of(workers, loaded, wanted_size, change or [], over_time, plan)
         run = sequences.Run(
             loaded,
             over_time,
-            sequences.Plan(spp, pretrain, seed, denoise_),
+            plan,
             output,
             None if no_reference else reference_spp or DEFAULT_REFERENCE_SPP,
             environment.describe(),
             bars,
+            elsewhere,
         )
         try:
             run.run(cases)
         except KeyboardInterrupt:
             interrupted = True
             notes.append("Interrupted: not all frames are there. The same command goes on from here.")
+        except cluster.ClusterError as error:
+            problem = str(error)
+            notes.append(f"Not all frames are there: {problem}. The same command goes on from here.")
         if run.references is not None and run.references.exposures is not None:
             first, exposures = run.references.of(0), run.references.exposures
             notes += terminal.depth_notes(first, loaded, cases) + terminal.notes(first, False)
@@ -124,5 +137,7 @@ def sequence(
         for note in notes:
             terminal.out.print(note, soft_wrap=True, markup=False)
         terminal.out.print(f"wrote {output / 'report.html'}", soft_wrap=True, markup=False)
+    if problem:
+        raise InputError(f"{problem}; the same command goes on from here")
     if interrupted:
         raise KeyboardInterrupt("interrupted: the same command goes on from here")

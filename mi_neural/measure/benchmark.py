@@ -49,6 +49,7 @@ class Row:
 
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
     of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind.
+    `seconds_to_first_image` counts from the start of the process, compiling included.
     """
 
     scene: str
@@ -84,6 +85,7 @@ class Row:
     split: dict[str, float | None] | None = None
     interrupted: bool = False
     image: str | None = None
+    seconds_to_first_image: float | None = None
     statistics: dict[str, object] = field(default_factory=dict)
     environment: dict[str, object] = field(default_factory=dict)
 
@@ -152,29 +154,42 @@ class Bench:
 
     def run(self, cases: list[Case], plan: Plan) -> None:
         """Measure all cases: one-shot by budgets, then steady and sample rows, and the whole again for each repeat."""
-        kinds = [False, True] if self.guides else [False]
         for case in cases:
-            label, compiled = case.spec.label, False
-            for repeat in range(plan.repeats):
-                parts = [
-                    ([(label, "one-shot", s, d, repeat) for d in kinds], partial(self.one_shot, case, s, plan, repeat))
-                    for s in plan.seconds
-                ]
-                if plan.steady_frames:
-                    keys = [(label, "sample", None, d, repeat) for d in kinds]
-                    keys += [(label, "steady", s, d, repeat) for s in plan.frame_seconds for d in kinds]
-                    keys.append((label, "split", None, False, repeat))
-                    parts.append((keys, partial(self.steady, case, plan, repeat)))
-                for keys, measure in parts:
-                    if self.kept is not None and (found := self.kept.pictures(keys, self.reference, self.exposures)):
-                        for picture in found:
-                            self.on_picture(picture)
-                        continue
-                    if not compiled:
-                        self.compile(case, plan.seed)
-                        compiled = True
-                    measure()
+            compiled = False
+            for keys, measure in self._parts(case, plan):
+                if self.kept is not None and (found := self.kept.pictures(keys, self.reference, self.exposures)):
+                    for picture in found:
+                        self.on_picture(picture)
+                    continue
+                if not compiled:
+                    self.compile(case, plan.seed)
+                    compiled = True
+                measure()
             case.integrator = None  # what it holds shall not count as the next one's memory
+
+    def recall(self, case: Case, plan: Plan) -> bool:
+        """Hand over all rows of a case if none is left to be measured; returns whether that is so."""
+        found = [self.kept.pictures(keys, self.reference, self.exposures) for keys, _ in self._parts(case, plan)]
+        if not all(found):
+            return False
+        for picture in (picture for pictures in found for picture in pictures):
+            self.on_picture(picture)
+        return True
+
+    def _parts(self, case: Case, plan: Plan) -> list[tuple[list[tuple], Callable[[], None]]]:
+        """What is measured of a case, in pieces: the keys of the rows that a piece gives, and the call that does it."""
+        label, kinds = case.spec.label, [False, True] if self.guides else [False]
+        parts = []
+        for repeat in range(plan.repeats):
+            for seconds in plan.seconds:
+                keys = [(label, "one-shot", seconds, d, repeat) for d in kinds]
+                parts.append((keys, partial(self.one_shot, case, seconds, plan, repeat)))
+            if plan.steady_frames:
+                keys = [(label, "sample", None, d, repeat) for d in kinds]
+                keys += [(label, "steady", s, d, repeat) for s in plan.frame_seconds for d in kinds]
+                keys.append((label, "split", None, False, repeat))
+                parts.append((keys, partial(self.steady, case, plan, repeat)))
+        return parts
 
     # ----------------------------------------------------------------------------------------------------------------
 

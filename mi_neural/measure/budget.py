@@ -47,7 +47,7 @@ class Rendered:
     seconds_train    wall time in training, also in such as happens inside of the first render call
     seconds_render   wall time in rendering without it
     statistics       what the integrator says about itself, {} for Mitsuba's own
-    interrupted      Ctrl-C ended it early
+    interrupted      it ended early: by Ctrl-C, or by what `problem` says in one line
     """
 
     rgb: np.ndarray
@@ -58,6 +58,7 @@ class Rendered:
     seconds_render: float
     statistics: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
+    problem: str = ""
 
 
 class Accumulator:
@@ -194,6 +195,17 @@ def train_first(scene, integrator, sensor: int = 0, progress: Progress | None = 
     return clock() - start, interrupted
 
 
+def preview(scene, integrator, seed: int = 0, sensor: int = 0) -> Rendered | None:
+    """One sample a pixel with what has been learned so far, the integrator going on as if it had not been asked. None
+    for one that has nothing to learn or whose images grow from call to call."""
+    if not hasattr(integrator, "previewing") or getattr(integrator, "cumulative", False):
+        return None
+    run = _Run(scene, integrator, seed, sensor, None)
+    with integrator.previewing():
+        run.one_pass(1)
+    return replace(run.result(), interrupted=True)
+
+
 def render_samples(
     scene, integrator, spp: int, seed: int = 0, sensor: int = 0, progress: Progress | None = None,
     keep: Callable[[Rendered], None] | None = None,
@@ -202,13 +214,35 @@ def render_samples(
 
     `keep` is called every KEEP_SECONDS with the image so far, marked as interrupted.
     """
-    run = _Run(scene, integrator, seed, sensor, keep)
+    passes = plan_passes(scene, spp, sensor)
+    return render_passes(scene, integrator, passes, spp, seed=seed, sensor=sensor, progress=progress, keep=keep)
+
+
+def render_passes(
+    scene,
+    integrator,
+    passes: list[int],
+    spp: int,
+    *,
+    first: int = 0,
+    seed: int = 0,
+    sensor: int = 0,
+    progress: Progress | None = None,
+    keep: Callable[[Rendered], None] | None = None,
+    film: Accumulator | None = None,
+) -> Rendered:
+    """Render passes of so many samples a pixel each, those with the numbers from `first` on of an image of `spp`.
+
+    A pass's random numbers follow from `seed` and its number, so that parts of an image share none. `film`: where the
+    passes go, if something else is wanted of them than their mean.
+    """
+    run = _Run(scene, integrator, seed, sensor, keep, first, film)
     try:
         run.plan(spp)
-        for n in plan_passes(scene, spp, sensor):
+        for n in passes:
             run.one_pass(n)
             if progress:
-                progress(run.film.spp, spp)
+                progress(run.film.spp, sum(passes))
     except KeyboardInterrupt:
         run.interrupted = True
     finally:
@@ -306,11 +340,14 @@ def choose_pass(sizes: list[int], times: dict[int, float], remaining: float) -> 
 class _Run:
     """The state of one rendering: film, clocks, number of passes."""
 
-    def __init__(self, scene, integrator, seed: int, sensor: int, keep: Callable[[Rendered], None] | None) -> None:
+    def __init__(
+        self, scene, integrator, seed: int, sensor: int, keep: Callable[[Rendered], None] | None,
+        first: int = 0, film: Accumulator | None = None,
+    ) -> None:  # fmt: skip
         self.keep, self.kept = keep, clock()
         self.scene, self.integrator, self.seed, self.sensor = scene, integrator, seed, sensor
-        self.film = Accumulator()
-        self.n_passes = 0
+        self.film = Accumulator() if film is None else film
+        self.n_passes = first
         self.seconds_train = self.seconds_render = 0.0
         self.interrupted = False
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import ceil
 from pathlib import Path
@@ -192,6 +192,15 @@ class Plan:
 
 
 @dataclass
+class Frame:
+    """One frame as rendered, the seconds that it took to change the scene, and what it was rendered with."""
+
+    rendered: budget.Rendered
+    seconds_update: float
+    environment: dict[str, object]
+
+
+@dataclass
 class Result:
     """One integrator over the sequence: its folder, and a row (a dictionary) for each frame that is done."""
 
@@ -222,6 +231,9 @@ class Run:
     rendered anew. A cache file holds all that training changes, but not what a light sampler learned: with one, images
     after it are not those of an uninterrupted run to the last digit. Integrators without `save_cache`
     simply go on. ``KeyboardInterrupt`` passes through; `results` then holds what is done.
+
+    `elsewhere`, called with (case, range of frames), yields them in order as another place renders them. What the
+    integrator learns, it then learns here and before the first of them.
     """
 
     def __init__(
@@ -233,8 +245,10 @@ class Run:
         reference_spp: int | None = None,
         environment: dict[str, object] | None = None,
         progress: Callable[[str], budget.Progress | None] | None = None,
+        elsewhere: Callable[[Case, range], Iterator[Frame]] | None = None,
     ) -> None:
         self.loaded, self.sequence, self.plan, self.folder = loaded, sequence, plan, folder
+        self.elsewhere = elsewhere
         self.references = None
         if reference_spp:
             self.references = References(loaded, sequence, reference_spp, folder / "references")
@@ -287,9 +301,12 @@ class Run:
 
         # ---- In the state of frame 0, so that a cache file is met by the scene that it was begun in
         self.sequence.apply(0)
-        self.progress(f"{case.spec.label}: compiling")
-        sizes = sorted(set(budget.plan_passes(scene, self.plan.spp)))
-        case.seconds_compile = budget.warm_up(scene, integrator, sizes, self.plan.seed)
+        if self.elsewhere is None:
+            self.progress(f"{case.spec.label}: compiling")
+            sizes = sorted(set(budget.plan_passes(scene, self.plan.spp)))
+            case.seconds_compile = budget.warm_up(scene, integrator, sizes, self.plan.seed)
+        elif hasattr(integrator, "train"):
+            integrator.train(scene, 0)  # it meets the scene, as it does in compiling
         keeper = _Keeper(integrator, folder)
         done = keeper.load(len(result.rows))
         del result.rows[0 if done is None else done :]
@@ -301,13 +318,22 @@ class Run:
             result.facts.update(pretrained=0, seconds_pretrain=0.0)
         if not result.rows:
             self._pretrain(case, keeper, result, settings)
+        if self.elsewhere is not None and not result.rows:
+            bar = self.progress(f"{case.spec.label}: training")
+            seconds, interrupted = budget.train_first(scene, integrator, progress=bar)
+            if interrupted:
+                raise KeyboardInterrupt
+            result.facts["seconds_pretrain"] += seconds
+            keeper.save(0)
+            self._write_settings(folder, settings, result.facts)
 
         # ---- Frames
         start = len(result.rows)
         bar = self.progress(f"{case.spec.label}: frames")
         previous = result.image(start - 1).rgb if start else None
-        for frame in range(start, self.sequence.frames):
-            row, previous = self._frame(case, folder, frame, previous)
+        todo = range(start, self.sequence.frames)
+        for frame, found in zip(todo, (self.elsewhere or self._frames)(case, todo), strict=True):
+            row, previous = self._measure(case, folder, frame, found, previous)
             result.rows.append(row)
             with open(folder / "frames.jsonl", "a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
@@ -334,16 +360,22 @@ class Run:
                 keeper.save(0)
                 self._write_settings(result.folder, settings, facts)
 
-    def _frame(self, case: Case, folder: Path, frame: int, previous: np.ndarray | None):
-        """Render, measure and write one frame; returns (row, image)."""
+    def _frames(self, case: Case, frames: range) -> Iterator[Frame]:
+        """Frames rendered by this process, each when it is asked for."""
         scene, plan = self.loaded.scene, self.plan
-        start = clock()
-        self.sequence.apply(frame)
-        seconds_update = clock() - start
-        seed = budget.pass_seed(plan.seed, STREAM_FRAMES, frame)
-        rendered = budget.render_samples(scene, case.integrator, plan.spp, seed)
-        if rendered.interrupted:
-            raise KeyboardInterrupt
+        for frame in frames:
+            start = clock()
+            self.sequence.apply(frame)
+            seconds_update = clock() - start
+            seed = budget.pass_seed(plan.seed, STREAM_FRAMES, frame)
+            rendered = budget.render_samples(scene, case.integrator, plan.spp, seed)
+            if rendered.interrupted:
+                raise KeyboardInterrupt
+            yield Frame(rendered, seconds_update, self.environment)
+
+    def _measure(self, case: Case, folder: Path, frame: int, found: Frame, previous: np.ndarray | None):
+        """Measure and write one frame; returns (row, image)."""
+        plan, rendered = self.plan, found.rendered
         image, seconds_denoise = rendered.rgb, 0.0
         if plan.denoise:
             image, seconds_denoise = denoise.denoise(rendered.rgb, self._guides_of(frame))
@@ -357,7 +389,7 @@ class Run:
             plan.seed,
             denoised=plan.denoise,
             seconds_denoise=seconds_denoise,
-            environment=self.environment,
+            environment=found.environment,
             pretrain_frames=plan.pretrain,
         )
         row = {
@@ -367,7 +399,7 @@ class Run:
             "seconds_train": full.seconds_train,
             "seconds_render": full.seconds_render,
             "seconds_denoise": seconds_denoise,
-            "seconds_update": seconds_update,
+            "seconds_update": found.seconds_update,
             "spp": full.spp,
             "mean": full.mean,
             "nonfinite": full.nonfinite,
@@ -383,9 +415,9 @@ class Run:
                 before = self.references.of(frame - 1).rgb
                 row["smape_reference"] = metrics.smape(self.references.of(frame).rgb, before)
             reference = self.references.of(frame)
-            found, _ = metrics.errors(image, reference.rgb, reference.variance, self.references.exposures)
-            row.update(flip=found.flip, relmse=found.relmse, relmse_trimmed=found.relmse_trimmed)
-            full.flip, full.relmse, full.relmse_trimmed = found.flip, found.relmse, found.relmse_trimmed
+            errors, _ = metrics.errors(image, reference.rgb, reference.variance, self.references.exposures)
+            row.update(flip=errors.flip, relmse=errors.relmse, relmse_trimmed=errors.relmse_trimmed)
+            full.flip, full.relmse, full.relmse_trimmed = errors.flip, errors.relmse, errors.relmse_trimmed
         full.flicker, full.image = row["smape"], frame_path(folder, frame).name
         channels = dict(rendered.channels)
         if plan.denoise:
@@ -399,6 +431,7 @@ class Run:
         state = self.sequence.states[frame]
         if self._guides is None or self._guides[0] != state:
             first = self._guides is None
+            self.sequence.apply(frame)
             self._guides = state, denoise.render_guides(self.loaded.scene, self.plan.seed)
             if first:
                 denoise.warm_up(self._guides[1])

@@ -191,6 +191,11 @@ class Bars:
         return lambda done, total: self.progress.update(self.task, completed=done, total=total)
 
 
+def counted(n: int, noun: str) -> str:
+    """`1 worker`, `2 workers`."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
 def announce(text: str) -> None:
     err.print(text, soft_wrap=True, markup=False)
 
