@@ -47,7 +47,7 @@ GALLERY := $(BIN)/mi-neural compare
 PATHS := -i path -i nirc -i nrc -i nrc:termination=auto -i nirc_two_level -i nirc_two_level:mode=progressive \
     -i plain_path:light_sampler.type=nvc_lights --steady 200 --frame-seconds 0.25 --reference-spp 512
 DIRECT := -i path -i plain_path:light_sampler.type=power_lights -i plain_path:light_sampler.type=nvc_lights -i restir_di \
-    -i nvc_direct -i nvc_direct:mode=neural -D max_depth=2 --seconds 1 --reference-spp 512
+    -i nvc_direct -i nvc_direct:mode=neural -D max_depth=2 --steady 200 --frame-seconds 0.25 --reference-spp 512
 LAMP := lamp_panel.to_world=translate(0.7*sin(2*pi*t),-0.4*(1-cos(2*pi*t)),0)@value
 
 gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light: out/gallery/index.html; minutes, goes on where stopped
@@ -56,8 +56,8 @@ gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light
 	$(GALLERY) glossy_hall $(PATHS) --size 256x144 -o out/gallery/3_glossy_hall
 	$(GALLERY) lamp_bays $(PATHS) --size 256x144 -o out/gallery/4_lamp_bays
 	$(GALLERY) lamp_bays $(DIRECT) --size 256x144 -o out/gallery/5_direct_light
-	$(BIN)/mi-neural sequence cornell_box -i path -i nirc:blend=reliability --change "$(LAMP)" --frames 48 --pretrain 128 \
-	    --spp 1 --size 160x160 --no-reference -o out/gallery/6_moving_light
+	$(BIN)/mi-neural sequence cornell_box -i path -i nirc:blend=reliability --change "$(LAMP)" --frames 36 --pretrain 128 \
+	    --spp 4 --size 128x128 --no-reference -o out/gallery/6_moving_light
 	$(BIN)/python -m mi_neural.measure.gallery out/gallery
 
 gallery-pictures: gallery  ## the README's pictures, of the gallery

@@ -26,22 +26,25 @@ def results(tmp_path):
         image = label.replace(":", "_") + ".exr"
         exr.write(done / image, reference + error)
         rows.append({
-            "label": label, "image": image, "mode": "steady", "denoised": False, "size": [12, 8], "spp": 3.0,
+            "scene": "box", "label": label, "image": image, "mode": "steady", "denoised": False, "size": [12, 8],
+            "spp": 3.0,
             "budget_seconds": 0.25, "pretrain_frames": 200, "seconds_pretrain": 4.0, "seconds_train": 0.03,
             "seconds_render": 0.2, "relmse_trimmed": error, "flip": error,
         })  # fmt: skip
     command = "mi-neural compare box.xml -i path -D depth=3 -i nirc:cache_samples=8 --steady 200 -o out/1_box"
-    found = {"scene": "box", "size": [12, 8], "command": command, "reference": {"path": "/elsewhere/reference.exr"},
-             "rows": [*rows, {**rows[0], "mode": "sample"}, {**rows[0], "denoised": True}]}  # fmt: skip
+    scene = {"scene": "box", "size": [12, 8], "reference": {"path": str(done / "reference.exr")}}
+    others = [{**rows[0], "mode": "sample"}, {**rows[0], "denoised": True}, {**rows[0], "image": None}]
+    found = {"command": command, "scenes": [scene], "rows": [*others, *rows]}
     (done / "results.json").write_text(json.dumps(found))
 
     moving = tmp_path / "2_moving"
     for case in ("path", "nirc"):
         (moving / case).mkdir(parents=True)
-        (moving / case / "frames.jsonl").write_text("")
         for k in range(3):
             exr.write(moving / case / f"frame_{k:04d}.exr", np.full((8, 8, 3), 0.1 * (k + 1)))
-    (moving / "results.json").write_text(json.dumps({"scene": "box", "command": "mi-neural sequence box.xml -o x"}))
+    cases = [{"label": name, "folder": name, "rows": [{}] * 3} for name in ("path", "nirc")]
+    found = {"scene": "box", "command": "mi-neural sequence box.xml -o x", "cases": cases}
+    (moving / "results.json").write_text(json.dumps(found))
     return tmp_path
 
 
@@ -84,6 +87,12 @@ def test_sheet_and_animation(results):
         assert sheet.size == (3 * 12 + 2 * 4, 8), "reference and two pictures"
     with Image.open(results / "moving.webp") as moving:
         assert moving.n_frames == 3 and moving.size == (8 + 4 + 8, 8)
+
+
+def test_a_reference_that_is_gone_is_reported(results):
+    (results / "1_box" / "reference.exr").unlink()
+    with pytest.raises(InputError, match="is gone: run its mi-neural compare again"):
+        gallery.write(results)
 
 
 def test_nothing_to_show_says_what_to_do(tmp_path):

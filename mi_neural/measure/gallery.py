@@ -23,15 +23,15 @@ from .page import flip_colours
 from .report import number
 from .sequence import frame_path
 
-#: Frames a second of animations, and what WebP may lose (100: nothing).
-RATE, QUALITY = 12, 80
+#: Frames a second of animations; what WebP may lose of them and of sheets (100: nothing).
+RATE, MOVING_QUALITY, SHEET_QUALITY = 12, 60, 85
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; color: #222 }
 h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin: 2.5rem 0 .3rem }
 .row { display: flex; flex-wrap: wrap; gap: 1rem } figure { margin: 0; width: 290px }
 img { width: 100%; display: block; image-rendering: pixelated } figure img + img { margin-top: 2px }
-figcaption { font-size: 13px; line-height: 1.4 } figcaption b { font-size: 14px }
+figcaption { font-size: 13px; line-height: 1.4 } figcaption b { font-size: 14px; overflow-wrap: anywhere }
 code { font: 11.5px/1.35 ui-monospace, monospace; color: #555; overflow-wrap: anywhere; user-select: all }
 .wide { width: 620px } a { color: #0b5cad }
 """
@@ -42,12 +42,13 @@ def write(folder: Path, compact: Path | None = None, animation: Path | None = No
     sections, sheet, moving = [], [], []
     for results in sorted(folder.glob("*/results.json")):
         found = json.loads(results.read_text(encoding="utf-8"))
-        if any((results.parent / name / "frames.jsonl").is_file() for name in _folders(results.parent)):
+        if "cases" in found:  # of a sequence
             section, frames = _sequence(results.parent, found, folder)
             moving.append(frames)
         else:
-            section, pictures = _comparison(results.parent, found, folder)
-            sheet.append(pictures)
+            shown = [_comparison(results.parent, found, k, folder) for k in range(len(found["scenes"]))]
+            sheet += [pictures for _, pictures in shown]
+            section = "\n".join(text for text, _ in shown)
         sections.append(section)
     if not sections:
         raise InputError(f"{folder} holds no results of compare or sequence: run them with -o {folder}/NAME")
@@ -61,17 +62,16 @@ def write(folder: Path, compact: Path | None = None, animation: Path | None = No
         write_animation(moving[0], animation)
 
 
-def _folders(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.is_dir())
-
-
 # ------------------------------------------------------------------------------------------------------------------
 # Comparisons
 
 
-def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.ndarray]]:
-    """The section of a comparison, and its pictures in uint8."""
-    reference = exr.read(_reference_path(folder, found)).rgb
+def _comparison(folder: Path, found: dict, k: int, root: Path) -> tuple[str, list[np.ndarray]]:
+    """The section of scene number `k` of a comparison, and its pictures in uint8."""
+    scene, several = found["scenes"][k], len(found["scenes"]) > 1
+    report = folder.relative_to(root) / "report.html"
+    folder = folder / scene["scene"] if several else folder
+    reference = exr.read(_reference_path(folder, scene)).rgb
     exposure = exr.automatic_exposure(reference)
     exr.write_png(folder / "reference.png", reference, exposure)
     name = folder.relative_to(root)
@@ -79,7 +79,8 @@ def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.nda
     pictures = [exr.to_srgb8(reference, exposure)]
     seen = set()
     for row in found["rows"]:
-        if not row["image"] or row["denoised"] or row["mode"] == "sample" or row["label"] in seen:
+        shows = row["scene"] == scene["scene"] and row["image"] and not row["denoised"] and row["mode"] != "sample"
+        if not shows or row["label"] in seen:
             continue
         seen.add(row["label"])
         rgb = exr.read(folder / row["image"]).rgb
@@ -89,19 +90,18 @@ def _comparison(folder: Path, found: dict, root: Path) -> tuple[str, list[np.nda
         exr.write_bytes(folder / f"{stem}_flip.png", exr.png_bytes(flip_colours(error.map)))
         pictures.append(exr.to_srgb8(rgb, exposure))
         shown = [name / f"{stem}.png", name / f"{stem}_flip.png"]
-        figures.append(_figure(shown, _caption(row), command_of(row, found)))
-    width, height = found["size"]
-    title = f"{found['scene']}, {width}x{height}"
-    more = f'<p><a href="{name}/report.html">report</a> <code>{html.escape(found["command"])}</code></p>'
+        figures.append(_figure(shown, _caption(row), command_of(row, found["command"])))
+    width, height = scene["size"]
+    title = f"{scene['scene']}, {width}x{height}"
+    more = f'<p><a href="{report.as_posix()}">report</a> <code>{html.escape(found["command"])}</code></p>'
     return f'<h2>{html.escape(title)}</h2>\n{more}\n<div class="row">{"".join(figures)}</div>', pictures
 
 
-def _reference_path(folder: Path, found: dict) -> Path:
-    given = found.get("reference")
-    if not given:
-        raise InputError(f"{folder} was made without a reference; a gallery shows errors against one")
-    path = Path(given["path"])
-    return path if path.is_file() else folder / path.name
+def _reference_path(folder: Path, scene: dict) -> Path:
+    path = Path(scene["reference"]["path"])
+    if not path.is_file():
+        raise InputError(f"the reference of {folder}, {path}, is gone: run its mi-neural compare again")
+    return path
 
 
 def _caption(row: dict) -> str:
@@ -115,12 +115,12 @@ def _caption(row: dict) -> str:
     return f"<b>{html.escape(row['label'])}</b><br>{', '.join(cost)}<br>{', '.join(errors)}"
 
 
-def command_of(row: dict, found: dict) -> str:
-    """The command that renders such a picture as a row's."""
-    scene = shlex.split(found["command"])[2]  # mi-neural compare SCENE ..., or --scenes FOLDER
-    words = ["mi-neural", "render", found["scene"] if scene.startswith("-") else scene, "-i", row["label"]]
+def command_of(row: dict, command: str) -> str:
+    """The command that renders such a picture as that of a row which `command` made."""
+    given = [word for word in shlex.split(command)[2:] if Path(word).stem == row["scene"]]
+    words = ["mi-neural", "render", *(given[:1] or [row["scene"]]), "-i", row["label"]]
     width, height = row["size"]
-    words += [*_defines(found["command"]), "--size", f"{width}x{height}"]
+    words += [*_defines(command), "--size", f"{width}x{height}"]
     words += ["--pretrain", str(row["pretrain_frames"])] if row["pretrain_frames"] else []
     words += ["--seconds", f"{row['budget_seconds']:g}"] if row["budget_seconds"] else ["--spp", f"{row['spp']:g}"]
     return shlex.join([*words, "-o", "picture.png"])
@@ -143,14 +143,14 @@ def _figure(pictures: list[Path], caption: str, command: str, wide: bool = False
 
 def _sequence(folder: Path, found: dict, root: Path) -> tuple[str, list[np.ndarray]]:
     """The section of a sequence, and its frames, all integrators side by side, in uint8."""
-    cases = [folder / name for name in _folders(folder) if (folder / name / "frames.jsonl").is_file()]
-    counts = [len(list(case.glob("frame_*.exr"))) for case in cases]
-    images = [[exr.read(frame_path(case, k)).rgb for case in cases] for k in range(min(counts))]
+    cases = found["cases"]
+    n_frames = min(len(case["rows"]) for case in cases)
+    images = [[exr.read(frame_path(folder / case["folder"], k)).rgb for case in cases] for k in range(n_frames)]
     exposure = exr.automatic_exposure(np.concatenate(images[0]))
     frames = [montage([exr.to_srgb8(image, exposure) for image in strip], len(cases)) for strip in images]
     write_animation(frames, folder / "frames.webp")
     name = folder.relative_to(root)
-    caption = "from the left: " + ", ".join(html.escape(case.name) for case in cases)
+    caption = "from the left: " + ", ".join(html.escape(case["label"]) for case in cases)
     figure = _figure([name / "frames.webp"], caption, found["command"], wide=True)
     more = f'<p><a href="{name}/report.html">report</a></p>'
     return f'<h2>{html.escape(found["scene"])}, {len(frames)} frames</h2>\n{more}\n{figure}', frames
@@ -162,7 +162,8 @@ def write_animation(frames: list[np.ndarray], path: Path) -> None:
 
     first, *others = (Image.fromarray(frame) for frame in frames)
     with exr.replacing(path) as temporary:
-        first.save(temporary, save_all=True, append_images=others, duration=1000 // RATE, loop=0, quality=QUALITY)
+        first.save(temporary, save_all=True, append_images=others, duration=1000 // RATE, loop=0,
+                   quality=MOVING_QUALITY)  # fmt: skip
 
 
 def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
@@ -178,7 +179,7 @@ def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
     width = max(strip.shape[1] for strip in strips)
     padded = [np.pad(s, ((0, 4), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]
     with exr.replacing(path) as temporary:
-        Image.fromarray(np.concatenate(padded)[:-4]).save(temporary, quality=QUALITY)
+        Image.fromarray(np.concatenate(padded)[:-4]).save(temporary, quality=SHEET_QUALITY)
 
 
 PAGE = """<!DOCTYPE html>
