@@ -273,6 +273,22 @@ def test_frames_of_two_workers_are_those_of_one_process(address, tmp_path, integ
     np.testing.assert_allclose(found, known, rtol=1e-5 if integrator == "path" else 0.05, atol=1e-3)
 
 
+def test_cases_are_measured_by_the_workers(address, tmp_path, monkeypatch):
+    """Each row says where; a finished case is not measured again, and an integrator of one scene only is left out."""
+    monkeypatch.chdir(tmp_path)
+    command = ["compare", "cornell_box", "lit_cube", "-i", "path", "-i", "plain_path", "--seconds", "0.1", "--repeats",
+               "2", "--size", "16x16", "--reference-spp", "32", "--reference-cache", "kept", "-o", "out"]  # fmt: skip
+    done = CliRunner().invoke(app, [*command, "--scheduler", address])
+    assert done.exit_code == 0, done.output
+    assert "4 cases on 2 workers" in done.output
+    rows = [row for row in json.loads(Path("out/results.json").read_text())["rows"] if row["mode"] == "one-shot"]
+    found = {(row["scene"], row["label"], row["repeat"]) for row in rows}
+    assert len(found) == len(rows) == 8 and {row["scene"] for row in rows} == {"cornell_box", "lit_cube"}
+    assert len({row["environment"]["worker"] for row in rows}) == 2
+    assert all(row["environment"]["threads"] == 1 and row["relmse"] >= 0.0 and row["spp"] >= 1 for row in rows)
+    assert "</html>" in Path("out/report.html").read_text()
+
+
 # ---------------------------------------------------------------- what goes wrong is one line
 
 

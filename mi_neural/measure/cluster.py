@@ -174,9 +174,9 @@ class Workers:
     def map(self, jobs_and_data: list[tuple[object, object]]) -> Iterator[tuple[int, Answer | JobError]]:
         """Run jobs, each with its data (None: without; one object is sent once, for however many jobs).
 
-        Yields (index, answer) as they are done, in any order; a job that failed gives its error. A job whose worker dies
-        is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun. Raises
-        :class:`ClusterError`: a job took several workers with it, no worker or no scheduler is there any more.
+        Yields (index, answer) as they are done, in any order; a job that failed gives its error. A job whose worker
+        dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun.
+        Raises :class:`ClusterError`: a job lost several workers, no worker or no scheduler is there any more.
         """
         waiting, finished, call = deque(range(len(jobs_and_data))), queue.SimpleQueue(), _by_value()
         running: dict[object, tuple[int, str]] = {}  # future -> job, worker
