@@ -4,12 +4,13 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/mi_neural.stamp
+TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture bench test stress lint clean
+.PHONY: help demo picture bench gallery gallery-pictures docs notebooks test stress lint clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 # The environment, made once and again whenever pyproject.toml changes.
 $(STAMP): pyproject.toml
@@ -19,6 +20,11 @@ $(STAMP): pyproject.toml
 	it needs 3.10 or newer. Type: make PYTHON=python3.11" % v[:2])'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 	    echo "mi_neural: could not make $(VENV). On Debian and Ubuntu type: apt install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet -e '.[denoise]'
+	@touch $@
+
+# What tests need beside, which a picture does not wait for.
+$(TESTS): $(STAMP)
 	$(BIN)/python -m pip install --quiet -e '.[denoise,test]'
 	@touch $@
 
@@ -37,14 +43,43 @@ BENCH := -i path -i nirc -i nrc -i nirc:termination=auto -i nirc_two_level --sec
 bench: $(STAMP)  ## integrators on our own scenes: tables and report in out/bench; under 20 minutes on two cores, goes on where stopped
 	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 192x108,144x144 --reference-spp 1024 -o out/bench
 
+GALLERY := $(BIN)/mi-neural compare
+PATHS := -i path -i nirc -i nrc -i nrc:termination=auto -i nirc_two_level -i nirc_two_level:mode=progressive \
+    -i plain_path:light_sampler.type=nvc_lights --steady 200 --frame-seconds 0.25 --reference-spp 512
+DIRECT := -i path -i plain_path:light_sampler.type=power_lights -i plain_path:light_sampler.type=nvc_lights -i restir_di \
+    -i nvc_direct -i nvc_direct:mode=neural -D max_depth=2 --seconds 1 --reference-spp 512
+LAMP := lamp_panel.to_world=translate(0.7*sin(2*pi*t),-0.4*(1-cos(2*pi*t)),0)@value
+
+gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light: out/gallery/index.html; minutes, goes on where stopped
+	$(GALLERY) cornell_box $(PATHS) --size 144x144 -o out/gallery/1_cornell_box
+	$(GALLERY) ajar_door $(PATHS) --size 256x144 -o out/gallery/2_ajar_door
+	$(GALLERY) glossy_hall $(PATHS) --size 256x144 -o out/gallery/3_glossy_hall
+	$(GALLERY) lamp_bays $(PATHS) --size 256x144 -o out/gallery/4_lamp_bays
+	$(GALLERY) lamp_bays $(DIRECT) --size 256x144 -o out/gallery/5_direct_light
+	$(BIN)/mi-neural sequence cornell_box -i path -i nirc:blend=reliability --change "$(LAMP)" --frames 48 --pretrain 128 \
+	    --spp 1 --size 160x160 --no-reference -o out/gallery/6_moving_light
+	$(BIN)/python -m mi_neural.measure.gallery out/gallery
+
+gallery-pictures: gallery  ## the README's pictures, of the gallery
+	$(BIN)/python -m mi_neural.measure.gallery out/gallery --compact scenes/gallery.webp --animation scenes/moving_light.webp
+
+docs: pyproject.toml | $(STAMP)  ## the manual as HTML: out/docs/index.html
+	$(BIN)/python -m pip install --quiet -e '.[docs]'
+	$(BIN)/mi-neural doc --html out/docs
+
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
-test: $(STAMP)  ## the default tests, a few minutes on two cores
+test: $(TESTS)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-stress: $(STAMP)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
+stress: $(TESTS)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
 	$(BIN)/python tests/stress.py -o out/stress
 
-lint: $(STAMP)  ## ruff
+notebooks: $(STAMP)  ## run all notebooks in full length and keep their outputs, minutes
+	$(BIN)/python -m pip install --quiet -e '.[denoise,notebooks]'
+	$(BIN)/jupyter nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
+	    --ExecutePreprocessor.timeout=900 notebooks/*.ipynb
+
+lint: $(TESTS)  ## ruff
 	$(BIN)/ruff check .
 
 clean:  ## remove what builds, tests and the demo wrote (keeps .venv)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural import plan
 from mi_neural.lights.table import LightTable
 from mi_neural.transport.identity import SceneWatch
 
@@ -17,15 +18,16 @@ class LightSampler(mi.Emitter):
     own choice.
     """
 
-    #: Whether the texels of an environment are lights of their own.
-    texels = False
-
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
         self.scene, self.held = SceneWatch(), None
         self.watched: list = []
         self.sampler = None
+        self.plan_mode = props.get("plan", "scene")
+        self._check(self.plan_mode in plan.MODES,
+                    f"plan is '{self.plan_mode}'; give one of: {', '.join(plan.MODES)}")  # fmt: skip
+        self.plan: plan.ScenePlan | None = None  # of the scene that lights are chosen in
 
     def _check(self, ok: bool, message: str) -> None:
         if not ok:
@@ -45,6 +47,10 @@ class LightSampler(mi.Emitter):
         """What chooses among the lights of `table`; see :mod:`mi_neural.lights.sampling`."""
         raise NotImplementedError(f"{type(self).__name__} must define make()")
 
+    def given(self) -> dict:
+        """Decisions of the plan that keys have fixed, by part."""
+        return {}
+
     def train(self, scene, sensor) -> None:
         """Learn what is learned from image to image."""
 
@@ -54,6 +60,10 @@ class LightSampler(mi.Emitter):
 
     # -------------------------------------------------------------------------------------------------------------
 
+    def make_plan(self, facts: plan.SceneFacts) -> plan.ScenePlan:
+        """What is built in a scene of these facts, and why."""
+        return plan.of_sampler(facts, plan.Request(self.plugin, self.plan_mode, self.given()))
+
     def lights(self, scene, sensor, train: bool = True):
         """What chooses lights in `scene`; None where there is nothing to choose, at no cost then.
 
@@ -62,21 +72,23 @@ class LightSampler(mi.Emitter):
         if self.scene.changed(scene):
             self.reset()
             self.held, self.sampler = None, None
-            self.watched = _watch(scene, self.texels)
+            self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
+            self.watched = _watch(scene) if self.plan.modelled("light_sampler") else []
         if not self.watched:
             return None
         with dr.suspend_grad():
             if self.held is None or any(_changed(*w, h) for w, h in zip(self.watched, self.held, strict=True)):
                 self.held = [_hold(params[name]) for params, name in self.watched]
-                table = LightTable(scene, texels=self.texels)
-                self.sampler = self.make(scene, table) if table.n_lights > 1 else None
+                table = LightTable(scene, texels=self.plan.modelled("environment_cells"))
+                chooses = table.n_lights > 1 or self.plan_mode == "everything"
+                self.sampler = self.make(scene, table) if chooses else None
             if self.sampler is not None and train:
                 with dr.resume_grad():
                     self.train(scene, sensor)
         return self.sampler
 
     def to_string(self):
-        return f"{type(self).__name__}[]"
+        return f"{type(self).__name__}[plan = {self.plan or self.plan_mode}]"
 
     # -------------------------------------------------------------------------------------------------------------
     # It is an emitter to Mitsuba, whose calls are compiled for all emitters alive: one that gives nothing
@@ -106,15 +118,10 @@ class LightSampler(mi.Emitter):
         return dr.zeros(mi.Wavelength), mi.Spectrum(0)
 
 
-def _watch(scene, texels: bool) -> list:
-    """Parameters that the table is made of, as (parameters, name); empty if there is at most one light."""
-    emitters = scene.emitters()
-    if len(emitters) < 2 and not (texels and scene.environment() is not None) and not any(
-        e.get_shape() is not None and e.get_shape().primitive_count() > 1 for e in emitters
-    ):
-        return []
+def _watch(scene) -> list:
+    """Parameters that the table is made of, as (parameters, name)."""
     watched = []
-    for emitter in emitters:
+    for emitter in scene.emitters():
         shape = emitter.get_shape()
         params = mi.traverse(shape if shape is not None else emitter)
         watched += [(params, name) for name in params.keys() if not name.startswith("bsdf.")]

@@ -61,6 +61,10 @@ class NVCLightSampler(LightSampler):
      * - seed
        - |int|
        - Of the initial weights, the training points and the clusters. (Default: 0)
+     * - plan
+       - |string|
+       - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
+         faults. (Default: scene)
 
     *Works with* all emitters of Mitsuba; point, spot and directional lights, meshes of thousands of emissive triangles
     and the environment can be mixed. With a single light it costs nothing. *Leaves out* glossy lobes: surfaces weigh
@@ -82,6 +86,8 @@ class NVCLightSampler(LightSampler):
         self.outputs = props.get("outputs", 32)
         self.clusters = props.get("clusters", "auto")
         self.environment_cells = props.get("environment_cells", 0)
+        keys = ("outputs", "clusters", "environment_cells", "visibility")
+        self.fixed = {key: props[key] for key in keys if key in props}
         self.candidates = props.get("candidates", 16)
         self.visibility = props.get("visibility", True)
         self.train_frames = props.get("train_frames", 32)
@@ -95,7 +101,6 @@ class NVCLightSampler(LightSampler):
                     f"clusters is '{self.clusters}'; give one of: {', '.join(clusters.METHODS)}")  # fmt: skip
         self._check(0 <= self.environment_cells <= 256,
                     f"environment_cells is {self.environment_cells}; it must lie in 0..256")  # fmt: skip
-        self.texels = self.environment_cells > 0
         self._check(self.candidates >= 1, f"candidates is {self.candidates}; it must be at least 1")
         self._check(self.train_frames >= 0, f"train_frames is {self.train_frames}; it must be 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
@@ -116,7 +121,8 @@ class NVCLightSampler(LightSampler):
 
     def make(self, scene, table):
         try:
-            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed, self.environment_cells)
+            cells = int(self.plan["environment_cells"])
+            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed, cells)
         except ValueError as e:
             raise ValueError(f"{self.plugin}: {e}") from None
         field = self.cache.field if self.visibility else None
@@ -125,6 +131,9 @@ class NVCLightSampler(LightSampler):
             self.begun = False
             field = None
         return VisibleLights(table, groups, field, self.candidates)
+
+    def given(self) -> dict:
+        return self.fixed
 
     def train(self, scene, sensor) -> None:
         if not self.visibility:
@@ -141,7 +150,10 @@ class NVCLightSampler(LightSampler):
         return facts | (self.cache.statistics if self.visibility else {})
 
     def to_string(self):
-        return f"NVCLightSampler[outputs={self.outputs}, clusters={self.clusters}, candidates={self.candidates}]"
+        return (
+            f"NVCLightSampler[\n  outputs = {self.outputs},\n  clusters = {self.clusters},\n"
+            f"  candidates = {self.candidates},\n  plan = {self.plan or self.plan_mode}\n]"
+        )
 
 
 mi.register_emitter("nvc_lights", lambda props: NVCLightSampler(props))

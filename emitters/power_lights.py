@@ -19,9 +19,10 @@ class PowerLightSampler(LightSampler):
 
     .. pluginparameters::
 
-     * - (none)
-       -
-       -
+     * - plan
+       - |string|
+       - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
+         faults. (Default: scene)
 
     *Works with* all emitters of Mitsuba, nested in an integrator of this package under the name ``light_sampler``.
     Knows nothing of distance, direction or shadows: ``nvc_lights`` does.

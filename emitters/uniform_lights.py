@@ -18,9 +18,10 @@ class UniformLightSampler(LightSampler):
 
     .. pluginparameters::
 
-     * - (none)
-       -
-       -
+     * - plan
+       - |string|
+       - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
+         faults. (Default: scene)
 
     *Works with* all emitters of Mitsuba, nested in an integrator of this package under the name ``light_sampler``.
     Better in nearly every scene: ``nvc_lights``.

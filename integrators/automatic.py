@@ -76,7 +76,7 @@ def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
 
     lit = path.ends_lit
     features = where_active(
-        lit, (mi.Point3f(path.si.p),), lambda x: tuple(field.incident.encode(x)), field.incident.shape.n_features_total
+        lit, (mi.Point3f(path.si.p),), lambda x: tuple(field.incident.encode(x)), field.incident.shape.n_encoded
     )
     by_incident = reflect(
         field.incident, list(features), path.si, path.si.bsdf(path.ray), integrator.cache.n_queries, sampler, lit

@@ -5,18 +5,22 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural import plan
 from mi_neural.caches.blend import BLENDS
 from mi_neural.caches.field import CacheFileError, FieldShape
 from mi_neural.caches.files import damaged
 from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.caches.reliability import MEASURES, Reliability
+from mi_neural.integrators import planning
 from mi_neural.integrators.checks import check_film, check_scene, sensor_of
-from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, light_sampler_of
+from mi_neural.integrators.keys import SHARED_KEYS as SHARED_KEYS
+from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.transport.freezing import undisturbed
 from mi_neural.transport.identity import SceneWatch
 from mi_neural.transport.samples import PathSampler
@@ -27,81 +31,6 @@ PASS_SAMPLES = 2**20
 PACKET = 16
 #: Frames that `train_frames = -1` trains at least and at most.
 SETTLE_FRAMES = (128, 400)
-
-SHARED_KEYS = (
-    """
-     * - max_depth
-       - |int|
-       - Longest *traced* path in segments; -1 means no limit. Up to 2 the result is that of ``path`` (no cache is
-         asked). Beyond, light from the cache has been reflected any number of times: compare with an unlimited
-         ``path``. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Path depth from which Russian roulette may end a traced path. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Leave out what the camera sees of emitters directly. (Default: false)
-     * - train_frames
-       - |int|
-       - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
-     * - train_samples
-       - |int|
-       - Training paths per frame. (Default: 4096)
-     * - train_vertices
-       - |int|
-       - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)
-     * - train_steps
-       - |int|
-       - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
-     * - learning_rate
-       - |float|
-       - Of Adam, at the start; falls to a tenth. (Default: 0.01)
-     * - ema_decay
-       - |float|
-       - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)
-     * - freeze_cache
-       - |bool|
-       - Do not train at all; an untrained cache answers with a constant. (Default: false)
-     * - seed
-       - |int|
-       - Of the initial weights and the training paths. (Default: 0)
-     * - levels
-       - |int|
-       - Levels of the hash grid, two features each. (Default: 8)
-     * - hashmap_size
-       - |int|
-       - Most entries of a level. (Default: 32768)
-     * - width
-       - |int|
-       - Of the network's hidden layers. (Default: 32)
-     * - hidden_layers
-       - |int|
-       - Their number. (Default: 2)
-     * - blend
-       - |string|
-       - Which weights answer. ``ema``: their average, least noise, lags behind changes. ``fast``: those being trained.
-         ``reliability``: (1 - σ) average + σ trained, σ by place from how both agree with the training records; as
-         quick as ``fast`` where light changes, as still as ``ema`` elsewhere. ``switch``: the same with σ rounded to 0
-         or 1. For scenes that change; in still ones ``ema`` is best. (Default: ema)
-     * - reliability
-       - |string|
-       - How σ is found: ``evidence`` (a test whether the trained weights are better), ``correlation``, ``concordance``,
-         ``regression``. (Default: evidence)
-     * - reliability_normals
-       - |bool|
-       - Keep statistics apart by the six main directions of the normal. (Default: false)
-     * - last_rate
-       - |float|
-       - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be
-         quick)
-"""
-    + LIGHT_SAMPLER_KEY.strip("\n")
-    + """
-     * - channels
-       - |string|
-       - Extra channels to write, a comma-separated list; the plugin says which. (Default: none)
-"""
-)
 
 
 def scene_signature(scene) -> str:
@@ -139,8 +68,8 @@ def _sums(values: list, first, stride: int, count) -> list:
 
 def _in_keys(message: str) -> str:
     """A message of the library in the words of the plugin's keys."""
-    for name, key in (("n_paths", "train_samples"), ("n_vertices", "train_vertices"), ("n_levels", "levels"),
-                      ("n_hidden", "hidden_layers")):  # fmt: skip
+    names = {"n_paths": "train_samples", "n_vertices": "train_vertices", **{v: k for k, v in planning.SIZES.items()}}
+    for name, key in names.items():
         message = message.replace(name, key)
     return message
 
@@ -154,6 +83,7 @@ class _State:
         self.planned_spp: int | None = None
         self.ns_per_query = math.nan
         self.facts: dict = {}  # what was measured of the scene
+        self.plan: plan.ScenePlan | None = None  # of the scene that was rendered last
         self.watch = SceneWatch()
         self.reset()
 
@@ -175,6 +105,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
 
     #: Extra channels: name -> number of values (3: R, G, B)
     CHANNELS: dict[str, int] = {}  # noqa: RUF012
+    #: Whether the plan may choose a light sampler where none is nested.
+    CHOOSES_LIGHTS = False
 
     def __init__(self, props):
         super().__init__(props)
@@ -191,28 +123,33 @@ class CacheIntegrator(mi.SamplingIntegrator):
         self._check(self.train_frames >= -1, f"train_frames is {self.train_frames}; give -1 (until settled), 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
+        self.plan_mode = props.get("plan", "scene")
+        self._check(self.plan_mode in plan.MODES, f"plan is '{self.plan_mode}'; give one of: {', '.join(plan.MODES)}")
         try:
-            blend = props.get("blend", "ema")
+            blend = props.get("blend", self.default_blend(props))
             training = Training(
                 n_paths=props.get("train_samples", 4096),
                 n_vertices=props.get("train_vertices", 8),
                 learning_rate=props.get("learning_rate", 1e-2),
                 ema_decay=props.get("ema_decay", 0.99),
-                last_rate=props.get("last_rate", 0.1 if blend == "ema" else 1.0),
+                last_rate=props.get("last_rate", 0.1 if blend == "ema" or "blend" not in props else 1.0),
             )
-            shape = FieldShape(
-                n_levels=props.get("levels", 8),
-                hashmap_size=props.get("hashmap_size", 2**15),
-                width=props.get("width", 32),
-                n_hidden=props.get("hidden_layers", 2),
-            )
+            sizes = {"levels": props.get("levels", None), "hashmap_size": props.get("hashmap_size", None),
+                     "width": props.get("width", None), "hidden_layers": props.get("hidden_layers", None)}  # fmt: skip
+            given = {k: v for k, v in sizes.items() if v is not None}
+            shape = FieldShape(**{planning.SIZES[k]: v for k, v in given.items()})
         except ValueError as e:
             raise ValueError(f"{self.plugin}: {_in_keys(str(e))}") from None
         names = [n.strip() for n in props.get("channels", "").split(",") if n.strip()]
         for n in names:
             self._check(n in self.CHANNELS, f"unknown channel '{n}'; it has: {', '.join(self.CHANNELS)}")
         self.channels = names
-        self.light_sampler = light_sampler_of(props)
+        self.light_sampler = self.nested_sampler = light_sampler_of(props)
+        self.given = given
+        if self.nested_sampler is not None:
+            self.given["light_sampler"] = self.nested_sampler.plugin
+            if self.plan_mode == "everything":
+                self.nested_sampler.plan_mode = self.plan_mode
 
         measure, by_normal = props.get("reliability", "evidence"), props.get("reliability_normals", False)
         self._check(blend in BLENDS, f"blend is '{blend}'; give one of: {', '.join(BLENDS)}")
@@ -233,13 +170,18 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Radiance along camera rays: (L, valid, {channel: value}). `lights` chooses lights; None: the scene itself."""
         raise NotImplementedError(f"{type(self).__name__} must define estimate()")
 
+    def default_blend(self, props) -> str:
+        """Which weights answer where no key says it."""
+        return "ema"
+
     def settle(self, scene, sensor) -> None:
         """Measure, once per scene, what settings depend on; results go to ``state.facts``."""
 
     @property
     def needs_cache(self) -> bool:
-        """Whether the settings can lead to a query at all."""
-        return self.max_depth < 0 or self.max_depth > 2
+        """Whether the settings, in the scene of the plan, can lead to a query at all."""
+        cached = self.state.plan is None or self.state.plan.modelled("cache")
+        return cached and (self.max_depth < 0 or self.max_depth > 2)
 
     def settings(self, spp: int) -> tuple:
         """Numbers that may change from image to image, handed on to `estimate` as variables; `spp`: the image's."""
@@ -272,6 +214,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         if self.state.watch.changed(scene) or self.state.signature is None:
             try:
                 self._meet(scene, known is not self.state.watch.parts)
+                if self.state.plan is None or known is not self.state.watch.parts:
+                    planning.follow(self, planning.make_plan(self, scene, sensor))
             except ValueError:
                 self.state.watch.parts = known
                 raise
@@ -309,6 +253,17 @@ class CacheIntegrator(mi.SamplingIntegrator):
             self.state.passes.clear()  # recordings of the other scene
             self.cache.clear_recordings()
             self.state.facts = {}
+
+    @property
+    def caches(self) -> tuple[str, ...]:
+        """What may be asked for light, as a :class:`~mi_neural.plan.Request` names it."""
+        return ("incident",)
+
+    def make_plan(self, scene, sensor=0) -> plan.ScenePlan:
+        """What will be built in `scene`, what is left out, and why. Changes nothing."""
+        sensor = self._sensor(scene, sensor)
+        check_scene(scene, self.plugin)
+        return planning.make_plan(self, scene, sensor)
 
     def _train_first(self, scene, sensor, progress=None) -> None:
         auto = self.train_frames < 0
@@ -349,12 +304,22 @@ class CacheIntegrator(mi.SamplingIntegrator):
             self.state.image_open = False
         self.state.planned_spp = spp
 
+    @contextmanager
+    def previewing(self):
+        """Inside, images show what has been learned so far: they train nothing and count for nothing."""
+        known = self.state.images, self.state.queries, self.state.image_open
+        self.state.image_open = True
+        try:
+            yield
+        finally:
+            self.state.images, self.state.queries, self.state.image_open = known
+
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. What was learned so far stays as it is."""
         sensor = self._sensor(scene, sensor)
         images, queries = self.state.images, self.state.queries
         untouched = self.cache.field is None
-        fresh_lights = self.light_sampler is not None and not self.light_sampler.statistics().get("visibility_steps")
+        known_lights = self.light_sampler is not None and self.light_sampler.statistics().get("visibility_steps")
         self._ready(scene, sensor, train=False)
         if self.needs_cache:
             state = None if untouched else self.cache.checkpoint()
@@ -370,7 +335,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 self.measure_query()
             self.cache.rollback(state)
         self.state.images, self.state.queries = images, queries
-        if fresh_lights:
+        if self.light_sampler is not None and not known_lights:
             self.light_sampler.reset()
 
     def statistics(self) -> dict:
@@ -384,6 +349,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         if self.light_sampler is not None:
             s.update(self.light_sampler.statistics())
             s["seconds_train"] += s.get("seconds_visibility", 0.0)
+        if self.state.plan is not None:
+            s["plan"] = self.state.plan.to_json()
         if self.cache.field is not None:
             s["parameters"] = self.cache.field.n_parameters()
             s["scale"] = float(self.cache.field.scale[0])
@@ -391,7 +358,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             s["ns_per_query"] = self.state.ns_per_query
         return s
 
-    def measure_query(self, n: int = 2**18) -> float:
+    def measure_query(self, n: int = 2**16) -> float:
         """Nanoseconds per cache query, as :meth:`probe` asks it. Also kept for :meth:`statistics`."""
         field = self.cache.asked
         if field is None:
@@ -409,7 +376,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             for k in range(7):
                 dr.sync_thread()
                 t0 = time.perf_counter()
-                dr.eval(run(field, mi.UInt32(k)))
+                dr.eval(run(field, dr.opaque(mi.UInt32, k)))
                 dr.sync_thread()
                 times.append(time.perf_counter() - t0)
         self.state.ns_per_query = float(np.median(times[2:])) / (n * self.PROBES) * 1e9
@@ -453,7 +420,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         Raises `CacheFileError` (a ``ValueError``).
         """
         field, header, extra = self.cache.read(path)
-        if field.shape != self.cache.shape:
+        if not planning.fits(field.shape, self.cache.shape):
             raise CacheFileError(f"'{path}' holds a cache of {field.shape}, this integrator has {self.cache.shape}; "
                                  "give it the same sizes")  # fmt: skip
         self.check_file(path, header)
@@ -467,6 +434,10 @@ class CacheIntegrator(mi.SamplingIntegrator):
         except (KeyError, TypeError, ValueError) as e:
             raise damaged(path, e) from None
         self.state.loaded = (path, header.get("scene"))
+        if field.shape != self.cache.shape:
+            self.cache.shape = field.shape
+            self.cache.clear_recordings()
+            self.state.passes.clear()
 
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
@@ -505,6 +476,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         settings = _opaque(self.settings(self.state.planned_spp or spp))
         box = film.rfilter().is_box_filter()
         field = self.cache.asked if self.needs_cache else None
+        keys = tuple((k, v) for k, v in vars(self).items() if type(v) in (int, float, str))
 
         # A row of pixels at a time if one sample of all is too much, else several samples at a time
         done = 0
@@ -513,7 +485,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             rows = height if n * n_pixels <= 2 * PASS_SAMPLES else max(1, PASS_SAMPLES // (n * width))
             for y in range(0, height, rows):
                 n_rows = min(rows, height - y)
-                key = (id(scene), id(sensor), width, n_rows, n, box, border)
+                key = (id(scene), id(sensor), width, n_rows, n, box, border, keys)
                 if key not in self.state.passes:
                     self.state.passes[key] = self._frozen_pass(
                         width, n_rows, n, border, box, self.cache.freezes(sensor)

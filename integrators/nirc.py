@@ -4,16 +4,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
-from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.incident import IncidentCache
+from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
 from mi_neural.caches.pair import PairCache
+from mi_neural.caches.sh_grid import HarmonicCache
+from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.integrators import automatic
 from mi_neural.integrators.automatic import AUTO
-from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.integrators.common import CacheIntegrator
 from mi_neural.integrators.first_vertex import first_vertex
+from mi_neural.integrators.keys import SHARED_KEYS
+from mi_neural.integrators.planning import SIZES
 from mi_neural.transport import termination, vertex
 from mi_neural.transport.samples import PathSampler
 
+#: Caches of incident radiance without a network
+CONTROLS = {"spatial_hash": SpatialHashCache, "sh_grid": HarmonicCache}
 TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "auto")
 #: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
 #: the cache's directional detail does not suffice for it.
@@ -23,6 +31,8 @@ AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE, LIGHT = range(7)
 
 
 class NIRCIntegrator(CacheIntegrator):
+    CHOOSES_LIGHTS = True
+
     def __init__(self, props):
         super().__init__(props)
         self.cache_samples = props.get("cache_samples", 4)
@@ -44,6 +54,54 @@ class NIRCIntegrator(CacheIntegrator):
             self.cache = PairCache(
                 training, self.cache.training, self.cache.shape, self.seed, n_queries=self.cache_samples
             )
+        self._choose_cache(props.get("cache", "plan"))
+        if self.cache_samples == 0:
+            self.given["cache"] = False
+        if self.light_samples > 0:
+            self.given["light_samples"] = self.light_samples
+
+    def _choose_cache(self, kind: str) -> None:
+        """Put another cache of incident radiance in the place of the network, if a key says so."""
+        self._check(kind in ("plan", "network", *CONTROLS),
+                    f"cache is '{kind}'; give one of: plan, network, {', '.join(CONTROLS)}")  # fmt: skip
+        if kind != "plan":
+            self.given["cache"] = kind
+        if kind not in CONTROLS:
+            return
+        control, known = CONTROLS[kind], self.cache
+        self._check(self.termination != "auto", f"termination 'auto' needs cache 'network', not '{kind}'")
+        self._check(kind != "spatial_hash" or known.blend == "ema",
+                    f"blend is '{known.blend}'; a spatial hash has one set of means and needs 'ema'")  # fmt: skip
+        sizes = {name: self.given[key] for key, name in SIZES.items() if key in self.given}
+        unknown = [key for key, name in SIZES.items() if name in sizes and not hasattr(control.SHAPE, name)]
+        self._check(not unknown, f"{', '.join(unknown)} is a size of the network; cache is '{kind}'")
+        try:
+            shape = control.SHAPE(**sizes)
+        except ValueError as e:
+            raise ValueError(f"{self.plugin}: {e}") from None
+        self.cache = control(known.training, shape, self.seed, blend=known.blend, reliability=known.reliability)
+
+    def default_blend(self, props) -> str:
+        blends = self.plan_mode == "everything" and props.get("termination", "adaptive") != "auto"
+        return "reliability" if blends else "ema"
+
+    @property
+    def caches(self) -> tuple[str, ...]:
+        return ("outgoing", "incident") if self.termination == "auto" else ("incident",)
+
+    def use_cache(self, cache) -> None:
+        """Train and ask `cache` from now on; it starts anew, with the constants of training that it was made with.
+
+        An :class:`~mi_neural.caches.incident.IncidentCache`, or one of a class of your own that derives from it, see
+        :mod:`mi_neural.caches.arrays`. Raises ValueError for another, and with termination ``auto``, which has two.
+        """
+        self._check(self.termination != "auto", "termination 'auto' has two caches of its own; use_cache() takes one")
+        fits = isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache)
+        self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
+                    f"{type(cache).__name__}")  # fmt: skip
+        self.cache = cache
+        self.state.passes.clear()
+        self.reset()
 
     @property
     def needs_cache(self) -> bool:
@@ -85,14 +143,17 @@ class NIRCIntegrator(CacheIntegrator):
         _, mean, square, sampler = dr.while_loop(
             (mi.UInt32(0), mi.Float(0), mi.Float(0), sampler), lambda k, *_: k < 4, once
         )
+        dr.eval(mean, square, L)  # one kernel, not one for each
         variance = np.array(dr.maximum(square - dr.square(mean), 0)) * (4 / 3)
         # Relative to the brightness of the place, the scene's mean being its floor
         level = float(np.mean(np.array(mean + dr.mean(L))))
         if self.cache.field is not None:
             level += float(self.cache.field.scale[0])
         noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
-        self.state.facts["direct_noise"] = float(noise)
-        self.state.facts["light_samples"] = 1 if noise < 0.02 else 2 if noise < 0.08 else 4
+        chosen = plan.light_samples(float(noise))
+        self.state.facts |= {"direct_noise": float(noise), "light_samples": chosen.value}
+        if self.state.plan is not None:
+            self.state.plan.decisions["light_samples"] = chosen
 
     def probe(self, field, x, sampler):
         return super().probe(getattr(field, "incident", field), x, sampler)
@@ -273,7 +334,7 @@ class NIRCIntegrator(CacheIntegrator):
             f"  light_samples = {self.n_light}{' (chosen)' if self.light_samples < 0 else ''},\n"
             f"  max_depth = {self.max_depth},\n"
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
-            f"  frames trained = {self.cache.steps}\n]"
+            f"  frames trained = {self.cache.steps},\n  plan = {self.state.plan or self.plan_mode}\n]"
         )
 
 
@@ -315,6 +376,12 @@ NIRCIntegrator.__doc__ = (
        - |int|
        - Directions :math:`N_c` in which the cache is asked per camera sample. 0: no cache, ``nirc`` is a path tracer.
          (Default: 4)
+     * - cache
+       - |string|
+       - What the cache is. ``network``: hash grid and MLP. Two controls without a network: ``spatial_hash``, means of
+         the records by cell and direction, and ``sh_grid``, spherical harmonics on a hash grid; of the sizes they take
+         ``levels`` and ``hashmap_size`` alone, with defaults of their own. ``plan``: what the plan says, which is the
+         network (README: measured). (Default: plan)
      * - light_samples
        - |int|
        - Emitter samples, and traced BSDF samples :math:`N_l`, at the first vertex per camera sample. -1: 1, 2 or 4, by
@@ -324,13 +391,9 @@ NIRCIntegrator.__doc__ = (
        - Constant c of the spread test a > c a_0; 0: no surface is too near. (Default: 0.01)
      * - gather_half
        - |float|
-       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)
-    """
-    + SHARED_KEYS.strip("\n")
-    + r"""
-
-    """
-    + AUTO.strip("\n")
+       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)"""
+    + SHARED_KEYS
+    + AUTO
     + r"""
     It traces one BSDF sample a vertex (``light_samples``, ``gather_half`` have no effect).
 

@@ -95,6 +95,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         super()._meet(scene, is_another)
         if is_another and self.mixed is not None:
             self.mixed.nirc.state.passes.clear()
+            self.mixed.compiled.clear()
 
     def _ready(self, scene, sensor, train: bool = True) -> None:
         super()._ready(scene, sensor, train)
@@ -149,7 +150,10 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
 
     def _render(self, scene, sensor, seed: int, spp: int):
         if self.mixed is not None:
-            self.mixed.add(scene, sensor, seed, spp, lambda seed, n: self._parts(scene, sensor, seed, n))
+            take = self.mixed.compile if self.compiling else self.mixed.add
+            take(scene, sensor, seed, spp, lambda seed, n: self._parts(scene, sensor, seed, n))
+            if self.compiling:
+                return sensor.film().create_block()
             parts, n = self.mixed.parts(), self.mixed.n_unbiased
         elif any(name.startswith("variance") for name in self.channels):
             parts, n = Parts.of(self._parts(scene, sensor, seed, spp), self.inner_channels, self), spp
@@ -399,10 +403,11 @@ NIRCTwoLevelIntegrator.__doc__ = (
 
      * - mode
        - |string|
-       - ``unbiased``, or ``progressive``: half of the samples are those of ``nirc``, which share the cache, and the
-         image is theirs plus that part of the unbiased one's difference, scale by scale, that stands out of its noise;
-         biased, and consistent: it tends to the unbiased image. For "the best image in T seconds". The unbiased part is
-         path tracing there, unless the keys below say otherwise. (Default: unbiased)
+       - ``unbiased``, or ``progressive``: most samples are those of ``nirc``, which share the cache, and the more of
+         them unbiased ones the more bias is found; the image is the biased one plus that part of the unbiased one's
+         difference, scale by scale, that stands out of its noise; biased, and consistent: it tends to the unbiased
+         image. For "the best image in T seconds". The unbiased part is path tracing there, unless the keys below say
+         otherwise. (Default: unbiased)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is asked per camera sample, those that are traced included. 0: path

@@ -5,13 +5,15 @@ import math
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural import plan
 from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape, OutgoingTraining
 from mi_neural.caches.pair import PairCache
 from mi_neural.integrators import automatic, prefix
 from mi_neural.integrators.automatic import AUTO
-from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.integrators.keys import SHARED_KEYS
 from mi_neural.transport.suffixes import surface_of
 
 #: Where paths end
@@ -22,6 +24,8 @@ KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cach
 
 
 class NRCIntegrator(CacheIntegrator):
+    CHOOSES_LIGHTS = True
+
     def __init__(self, props):
         super().__init__(props)
         self.spread_threshold = props.get("spread_threshold", 0.01)
@@ -32,6 +36,13 @@ class NRCIntegrator(CacheIntegrator):
         if self.termination == "auto":
             self._check(self.content == "reflected", "termination 'auto' needs cache_content 'reflected'")
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
+        told = props.get("inputs", "plan")
+        if told != "plan":
+            names = {n.strip() for n in told.split(",") if n.strip()}
+            self._check(names <= set(plan.INPUTS), f"inputs is '{told}'; give a list of: {', '.join(plan.INPUTS)}")
+            self.given |= {name: name in names for name in plan.INPUTS}
+        if not math.isfinite(self.spread_threshold):
+            self.given["cache"] = False
         # A path of infinite spread threshold never asks the cache; its training paths end by the paper's constant
         chosen = {
             "threshold": self.spread_threshold if math.isfinite(self.spread_threshold) else 0.01,
@@ -57,6 +68,14 @@ class NRCIntegrator(CacheIntegrator):
                 training, OutgoingShape.like(sizes), self.seed, blend=self.cache.blend,
                 reliability=self.cache.reliability,
             )  # fmt: skip
+
+    def default_blend(self, props) -> str:
+        blends = self.plan_mode == "everything" and props.get("termination", "spread") != "auto"
+        return "reliability" if blends else "ema"
+
+    @property
+    def caches(self) -> tuple[str, ...]:
+        return ("outgoing", "incident") if self.termination == "auto" else ("outgoing",)
 
     def settings(self, spp: int) -> tuple:
         return (float(spp),)
@@ -124,7 +143,7 @@ class NRCIntegrator(CacheIntegrator):
             f"NRCIntegrator[\n  spread_threshold = {self.spread_threshold},\n  cache_content = {self.content},\n"
             f"  max_depth = {self.max_depth},\n"
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
-            f"  frames trained = {self.cache.steps}\n]"
+            f"  frames trained = {self.cache.steps},\n  plan = {self.state.plan or self.plan_mode}\n]"
         )
 
 
@@ -173,6 +192,10 @@ NRCIntegrator.__doc__ = (
        - |string|
        - What the cache holds. ``reflected``: all reflected light. ``indirect``: without direct light, which is traced
          at the terminal vertex too: less bias, for one more bounce. (Default: reflected)
+     * - inputs
+       - |string|
+       - What the network is told of a surface beside its position: a list of ``normal``, ``view``, ``albedo``,
+         ``roughness``; ``plan``: what the scene needs. A cache that was loaded keeps its own. (Default: plan)
      * - train_suffix
        - |string|
        - Where training paths end: ``spread``, as above, or ``full``, at ``train_vertices`` whatever the spread.
@@ -188,13 +211,9 @@ NRCIntegrator.__doc__ = (
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first
-         vertex, mirrors or glass): less noise in the records, some bias. (Default: 0)
-    """
-    + SHARED_KEYS.strip("\n")
-    + r"""
-
-    """
-    + AUTO.strip("\n")
+         vertex, mirrors or glass): less noise in the records, some bias. (Default: 0)"""
+    + SHARED_KEYS
+    + AUTO
     + r"""
     The incident cache is asked in 4 directions; ``cache_content`` must be ``reflected``.
 

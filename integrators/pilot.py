@@ -53,8 +53,6 @@ class Split:
         return f"Nc {self.n_cache}, Nr {self.n_traced * self.probability:g}, alpha {alpha}"
 
 
-PATH_TRACING = Split()
-
 
 class Choice:
     """The division in use. Keys that are given stay; the others are chosen by :meth:`measure`, if there are any.
@@ -103,6 +101,11 @@ class Choice:
         self.measured_at = -1
         self.rendered = 0  # camera samples, those of the image under way included
         self.seconds = 0.0
+
+    def split_into(self, n_traced: int) -> None:
+        """Trace so many directions, if their number was not given."""
+        if self.given["n_traced"] is None:
+            self.split = replace(self.split, n_traced=n_traced)
 
     def state(self) -> tuple:
         """All that measuring changes, for :meth:`restore`."""

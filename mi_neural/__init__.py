@@ -19,9 +19,10 @@ __version__ = "0.1.0"
 # Public names, and the modules that are imported when they are first used
 _LAZY = {
     "Field": "mi_neural.caches.field",
+    "live": "mi_neural.explore.live",
 }
 
-__all__ = ["Field", "LLVMError", "__version__", "llvm", "register", "variant_problem"]
+__all__ = ["Field", "LLVMError", "__version__", "live", "llvm", "register", "variant_problem"]
 
 
 def __getattr__(name):

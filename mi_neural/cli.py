@@ -1,5 +1,5 @@
-"""The command `mi-neural`: render a scene, compare integrators at equal time or over a changing scene, say what is
-installed.
+"""The command `mi-neural`: render a scene, compare integrators at equal time or over a changing scene, say what
+a scene needs and what is installed.
 
 Progress goes to stderr and results to stdout. Exit codes: 0 done, 2 the input cannot be used (one line says why),
 130 (Ctrl-C) and 143 (SIGTERM) interrupted, with what was rendered so far on disk.
@@ -10,7 +10,9 @@ from __future__ import annotations
 import typer
 
 from mi_neural.commands.compare import compare
+from mi_neural.commands.doc import doc
 from mi_neural.commands.info import info
+from mi_neural.commands.plan import plan
 from mi_neural.commands.render import render
 from mi_neural.commands.sequence import sequence
 from mi_neural.measure import terminal
@@ -25,7 +27,9 @@ app = typer.Typer(
 app.command()(render)
 app.command()(compare)
 app.command()(sequence)
+app.command()(plan)
 app.command()(info)
+app.command()(doc)
 
 
 def main() -> None:

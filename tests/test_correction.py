@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_neural.transport.correction import box_mean, correction, smooth
+from mi_neural.transport.correction import box_mean, correction, share_of_noise, smooth
 
 SHAPE = (48, 64, 3)
 
@@ -120,10 +120,25 @@ def test_tiny_images_with_noise(rng, shape):
 
 
 def test_box_mean_is_a_mean_over_squares_cut_at_the_borders(rng):
-    values = rng.normal(size=(9, 12, 2))
+    values = rng.normal(size=(2, 9, 12))
     for radius in (0, 1, 3, 20):
         found = box_mean(values, radius)
         for y, x in ((0, 0), (4, 5), (8, 11), (2, 10)):
-            part = values[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
-            np.testing.assert_allclose(found[y, x], part.mean(axis=(0, 1)), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(smooth(np.full((9, 12, 2), 3.0), 2), 3.0)
+            part = values[:, max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
+            np.testing.assert_allclose(found[:, y, x], part.mean(axis=(1, 2)), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(smooth(np.full((2, 9, 12), 3.0), 2), 3.0)
+
+
+def test_two_noisy_images_are_weighed_by_their_variances(rng, level):
+    """Expectation: the mean with the weight found has less variance than either, and than weights nearby."""
+    v_biased, v_unbiased = (0.3 * level) ** 2, (0.5 * level) ** 2
+    w = share_of_noise(v_biased, v_unbiased, level)
+    print(f"weight {w:.3f}, by the variances {0.09 / (0.09 + 0.25):.3f}")
+    assert w == pytest.approx(0.09 / (0.09 + 0.25), rel=1e-3)
+    assert share_of_noise(0 * v_biased, v_unbiased, level) == 0
+    assert share_of_noise(v_biased, 0 * v_unbiased, level) == 1
+    assert share_of_noise(0 * level, 0 * level, 0 * level) == 0
+    v_unbiased[3, 3] = np.inf
+    assert 0 <= share_of_noise(v_biased, v_unbiased, level) <= 1
+    v_biased[:] = np.nan
+    assert share_of_noise(v_biased, v_unbiased, level) == 0

@@ -114,15 +114,15 @@ def test_points_outside_the_box_give_what_its_surface_gives():
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_packed_network_is_the_tensor_network(name):
+def test_training_predicts_what_queries_of_its_weights_say(name):
     field = make(SHAPES[name])
     train(field, 2, wave)
     x, w = places(512)
-    tensor = np.array(dr.detach(field.predict(x, w)))
+    predicted = np.array(dr.detach(field.predict(x, w)))
     field.sync()
-    packed = np.array(field.raw(field.encode(x, averaged=False), w, averaged=False))
-    print(f"largest difference {np.abs(tensor - packed).max():.1e}")
-    np.testing.assert_allclose(packed, tensor, atol=2e-5)
+    found = np.array(field.raw(field.encode(x, averaged=False), w, averaged=False))
+    print(f"largest difference {np.abs(predicted - found).max():.1e}")
+    np.testing.assert_allclose(found, predicted, atol=2e-5)
 
 
 def test_box_of_records_leaves_outliers_out_and_is_never_flat():

@@ -28,6 +28,8 @@ LAYERS = [
     {"emitters"},  # light samplers do not know integrators
     {"integrators"},
     {"measure"},
+    {"explore"},
+    {"manual"},
     {"commands"},
     {"cli"},
 ]

@@ -117,6 +117,11 @@ def test_bias_and_variance_of_a_group_are_told_apart(rng):
     assert group.variance == pytest.approx(0.25 / 1.01, rel=0.05)
     whole = np.mean([metrics.relmse(i, known.rgb) for i in images.values()])
     assert group.squared_bias + group.variance == pytest.approx(whole, rel=0.02)  # but for the trimming
+    without_noise = group.squared_bias_error
+    noisy = reference.Reference(known.rgb, np.full((40, 40, 3), 0.5, np.float32), {}, None)
+    repeats.tell_apart(group, lambda row: images[row.repeat], noisy)
+    of_reference = math.sqrt(2) * 0.5 / 1.01 / math.sqrt(4800)
+    assert group.squared_bias_error == pytest.approx(math.hypot(without_noise, of_reference), rel=0.05)
     (single,) = repeats.group([row()])
     repeats.tell_apart(single, lambda row: images[0], known)
     assert single.squared_bias is single.variance is None

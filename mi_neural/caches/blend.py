@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .field import Field, Weights, own_copy
+from .field import Field, own_copy
 from .reliability import Reliability, ReliabilityGrid
 
 BLENDS = ("ema", "fast", "switch", "reliability")
@@ -31,7 +31,7 @@ class Blend:
 
     def __init__(self, field: Field, mode: str, constants: Reliability | None = None):
         self.field, self.mode = field, mode
-        self.fast = Weights(field.shape, field.seed)
+        self.fast = type(field.averaged)(field.shape, field.seed)
         self.grid = None
         if mode != "fast":
             self.grid = ReliabilityGrid(*field.box, constants, scale=float(field.scale[0]))
@@ -71,7 +71,7 @@ class Blend:
         """What depends on the position alone, of either predictor where it counts."""
         if self.grid is None:
             return None, None, self.field.features(self.fast, x)
-        sigma, n_values = self.sigma(x, n), self.field.shape.n_features_total
+        sigma, n_values = self.sigma(x, n), self.field.shape.n_encoded
         return sigma, *(
             where_active(asks, (mi.Point3f(x),), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
             for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))

@@ -45,14 +45,6 @@ class ControlVariate:
         dr.make_opaque(self.alpha)
 
     @property
-    def box_min(self):
-        return self.field.box_min
-
-    @property
-    def box_inv_extent(self):
-        return self.field.box_inv_extent
-
-    @property
     def scale(self):
         return self.field.scale
 
@@ -76,7 +68,7 @@ class ControlVariate:
         if active is True:
             return self.field.encode(x)
         return list(where_active(active, (mi.Point3f(x),), lambda x: tuple(self.field.encode(x)),
-                                 self.field.shape.n_features_total))  # fmt: skip
+                                 self.field.shape.n_encoded))  # fmt: skip
 
     def query(self, features: list, w, active=True):
         """Radiance from direction `w` at the encoded position, in [0, 1e4 scale]."""

@@ -105,9 +105,8 @@ class DirectCache:
         p = field.predict(x, None)
         p = dr.select(p > 0, p, LEAK * p)
         epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
-        total = dr.sum(dr.select(valid, loss.relative_l2(p, y, epsilon), 0)) / n_valid
-        field.step(total, learning_rate, decay)
-        return dr.detach(total)
+        errors = dr.select(valid, loss.relative_l2(p, y, epsilon), 0) / n_valid
+        return field.step(errors, learning_rate, decay)
 
     def train(self, scene, sensor, lights, steps: int = 1) -> None:
         """So many steps, each on fresh points."""

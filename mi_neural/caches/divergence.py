@@ -25,10 +25,12 @@ class StepWatch:
         self.known = [_network(o) for o in optimizers]
 
     def step(self, *optimizers) -> float:
-        """Length of the step since `begin`, over that of the weights before it; NaN where they are not finite."""
+        """Length of the step since `begin`, over that of the weights before it; NaN where they are not finite, 0 where
+        there is no network."""
         with np.errstate(all="ignore"):
             moved = [np.linalg.norm(_network(o) - w) for o, w in zip(optimizers, self.known, strict=True)]
-            return float(np.max([m / max(np.linalg.norm(w), 1e-30) for m, w in zip(moved, self.known, strict=True)]))
+            lengths = [m / max(np.linalg.norm(w), 1e-30) for m, w in zip(moved, self.known, strict=True)]
+            return float(np.max(lengths, initial=0.0))
 
 
 def healthy(length: float, steps: int) -> bool:
@@ -37,4 +39,5 @@ def healthy(length: float, steps: int) -> bool:
 
 
 def _network(optimizer) -> np.ndarray:
-    return np.concatenate([np.array(dr.detach(v), np.float64).ravel() for k, v in optimizer.items() if k != "grid"])
+    layers = [np.array(dr.detach(v), np.float64).ravel() for k, v in optimizer.items() if k != "grid"]
+    return np.concatenate(layers) if layers else np.zeros(0)

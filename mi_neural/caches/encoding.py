@@ -25,6 +25,15 @@ def direction(w, degree: int) -> list:
     return dr.sh_eval(mi.Vector3f(w), degree)
 
 
+def octahedral(w):
+    """Point of the unit square of a unit vector, by projection to an octahedron (Cigolle et al. 2014)."""
+    scale = dr.rcp(dr.maximum(dr.abs(w.x) + dr.abs(w.y) + dr.abs(w.z), 1e-30))
+    x, y = w.x * scale, w.y * scale
+    below = w.z < 0
+    folded = dr.mulsign(1 - dr.abs(y), x), dr.mulsign(1 - dr.abs(x), y)
+    return mi.Point2f(dr.select(below, folded[0], x), dr.select(below, folded[1], y)) * 0.5 + 0.5
+
+
 def _blob_integral(u):
     """Integral of the kernel ``15/16 (1 - u²)²`` from -1 to u."""
     u = dr.clip(u, -1, 1)

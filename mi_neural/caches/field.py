@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from . import encoding, files
+from . import backprop, encoding, files
 from .files import FILE_VERSION, CacheFileError
 
 __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedField", "Weights"]
@@ -66,6 +66,16 @@ class FieldShape:
     def n_inputs(self) -> int:
         return self.n_features_total + (self.direction_degree + 1) ** 2
 
+    @property
+    def n_first(self) -> int:
+        """Inputs, the first ones, whose share of the first layer is computed once per point."""
+        return self.n_features_total
+
+    @property
+    def n_encoded(self) -> int:
+        """Values that :meth:`Field.encode` gives for a position."""
+        return self.width
+
 
 def own_copy(value):
     """An evaluated, detached copy in memory of its own: not shared with another variable or with NumPy (such memory
@@ -87,13 +97,16 @@ def attach_adam(parameters: dict) -> Adam:
     return optimizer
 
 
-def descend(optimizer: Adam, loss, averaged: dict, learning_rate, decay) -> dict:
-    """One step of Adam down the gradient of `loss`, a differentiable scalar array; returns the new averaged parameters.
+def descend(optimizer: Adam, losses, averaged: dict, learning_rate, decay) -> tuple[dict, mi.Float]:
+    """One step of Adam down the gradient of the sum of `losses`, a differentiable array. Returns (the new averaged
+    parameters, the sum).
 
-    ``averaged <- decay averaged + (1 - decay) current``. A loss that is not finite changes nothing. May be frozen.
+    ``averaged <- decay averaged + (1 - decay) current``. A sum that is not finite changes nothing. May be frozen.
     """
-    dr.backward(loss)
-    ok = dr.isfinite(dr.detach(loss))
+    dr.schedule(dr.detach(losses))  # summed beforehand, they would take a kernel of their own that goes forth
+    dr.backward(losses)
+    loss = dr.sum(dr.detach(losses))
+    ok = dr.isfinite(loss)
     # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
     optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in optimizer})
     optimizer.step(eval=False, active=ok)
@@ -101,7 +114,7 @@ def descend(optimizer: Adam, loss, averaged: dict, learning_rate, decay) -> dict
     decay = dr.select(ok, decay, 1)
     averaged = {k: dr.lerp(dr.detach(optimizer[k]), v, decay) for k, v in averaged.items()}
     dr.eval(optimizer, averaged)
-    return averaged
+    return averaged, loss
 
 
 def moments_of(optimizer: Adam) -> dict[str, np.ndarray]:
@@ -123,11 +136,26 @@ def set_moments(optimizer: Adam, arrays: dict[str, np.ndarray]) -> None:
         optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), steps), *taken, largest)
 
 
+def _split(mlp, n_first: int) -> dict[str, np.ndarray]:
+    """The numbers 1, 2, ... of an MLP's parameters, in the shapes and by the names of one whose first layer is split
+    behind its first `n_first` inputs."""
+    found, start = {}, 1
+    for k, v in mlp.items():
+        _, index, name = k.split(".")
+        numbers = np.arange(start, start + dr.prod(v.shape)).reshape(v.shape)
+        start += numbers.size
+        if k == "layers.0.weights":
+            numbers, others = numbers[:, :n_first], numbers[:, n_first:]
+            found["layers.1.weights"] = others if others.size else np.zeros((len(numbers), 1))
+        found[f"layers.{int(index) + (index != '0')}.{name}"] = numbers
+    return found
+
+
 class Weights:
     """One set of weights: a hash grid, an MLP as tensors, and the same MLP packed for queries.
 
-    Training multiplies matrices (tensor mode), queries use cooperative vectors. Measured on two cores, 28,672 records
-    through 32-32-32-3 forward and back: tensors 16 ms, cooperative vectors 38 ms; queries are 1 ns apart.
+    Queries use cooperative vectors, and so does training on the CPU, see :mod:`.backprop`. In half precision, which
+    loses small gradients, training multiplies the tensors.
     """
 
     DRJIT_STRUCT = {"grid": object, "mlp": object, "packed": object, "order": object}  # noqa: RUF012
@@ -139,25 +167,31 @@ class Weights:
             hashmap_size=shape.hashmap_size, base_resolution=shape.base_resolution,
             per_level_scale=shape.per_level_scale, init_scale=1e-2, rng=dr.rng(seed=2 * seed),
         )  # fmt: skip
-        layers = []
-        for _ in range(shape.n_hidden):
-            layers += [nn.Linear(-1, shape.width), nn.LeakyReLU(shape.leak) if shape.leak else nn.ReLU()]
-        network = nn.Sequential(*layers, nn.Linear(-1, shape.n_outputs))
+
+        def layers():
+            for _ in range(shape.n_hidden):
+                yield nn.Linear(-1, shape.width)
+                yield nn.LeakyReLU(shape.leak) if shape.leak else nn.ReLU()
+            yield nn.Linear(-1, shape.n_outputs)
+
+        network = nn.Sequential(*layers())
         self.mlp = network.alloc(mi.TensorXf, shape.n_inputs, rng=dr.rng(seed=2 * seed + 1))
 
         # The one place where back ends differ: OptiX multiplies cooperative vectors in half precision, LLVM in single
         self.half = dr.backend_v(mi.Float) == dr.JitBackend.CUDA if half is None else half
         storage = mi.TensorXf16 if self.half else mi.TensorXf
+        # Packed, the first layer has two parts, for the inputs that are known once per point and for the others
+        self.n_first, n_others = shape.n_first, shape.n_inputs - shape.n_first
+        _, *rest = layers()
+        parts = [nn.Linear(self.n_first, shape.width), nn.Linear(max(n_others, 1), shape.width, bias=False)]
+        split = nn.Sequential(*parts, *rest)
         # nn.pack() cannot be frozen, so the order it gives is read off once, by packing the numbers 1, 2, ... digit by
         # digit (half precision counts to 2048)
         digits = []
         for divisor in (1, 1024):
-            numbered, start = network.alloc(storage, shape.n_inputs), 1
-            for k, v in self.mlp.items():
-                size = dr.prod(v.shape)
-                digit = (dr.arange(mi.UInt32, start, start + size) // divisor) % 1024
-                numbered[k] = storage(digit, shape=v.shape)
-                start += size
+            numbered = split.alloc(storage, self.n_first)
+            for k, v in _split(self.mlp, self.n_first).items():
+                numbered[k] = storage(np.float32(v // divisor % 1024))
             self.packed = nn.pack(numbered)
             digits.append(mi.UInt32(dr.round(mi.Float(self.packed["weights"]))))
         self.order = digits[0] + 1024 * digits[1]  # 0: padding
@@ -173,17 +207,46 @@ class Weights:
         for k in self.mlp:
             self.mlp[k] = parameters[k]
 
+    def finite(self):
+        """Whether all weights are, 1-wide."""
+        return dr.isfinite(dr.sum(dr.detach(self.grid.data)) + dr.sum(mi.Float(self.packed["weights"])))
+
     def pack(self) -> None:
         """Bring the packed MLP up to date."""
         flat = dr.concat([mi.Float(0), *(dr.detach(v).array for v in self.mlp.values())])
         weights = dr.gather(mi.Float, flat, self.order)
         self.packed["weights"] = type(self.packed["weights"])(weights)
 
+    def differentiable(self, inputs: list) -> list:
+        """The MLP's outputs as floats, differentiable with respect to `inputs` and the tensors. Packs the latter."""
+        if self.half:
+            n = dr.width(inputs)
+            inputs = dr.concat([i + dr.zeros(mi.Float, n) for i in inputs])
+            out = self.mlp(mi.TensorXf(inputs, shape=(dr.width(inputs) // n, n)))
+            return [out[i, :].array for i in range(out.shape[0])]
+        self.pack()
+        layers = self.packed.layers
+        return dr.custom(backprop.Perceptron, inputs, dict(self.mlp.items()), lambda: (layers, self.n_first))
+
     def __call__(self, inputs: list) -> list:
         """The MLP's outputs by cooperative vectors."""
-        if self.half:
-            inputs = [mi.Float16(i) for i in inputs]
-        return [mi.Float(o) for o in self.packed(nn.CoopVec(*inputs))]
+        return self.finish(self.start(inputs[: self.n_first]), inputs[self.n_first :])
+
+    def start(self, inputs: list) -> list:
+        """What the first `n_first` inputs add to the first layer, its bias included: once per point."""
+        return [mi.Float(v) for v in self.packed.layers[0](self._vector(inputs))]
+
+    def finish(self, started: list, inputs: list) -> list:
+        """The MLP's outputs, given :meth:`start` and the other inputs."""
+        x = self._vector(started)
+        if inputs:
+            x = x + self.packed.layers[1](self._vector(inputs))
+        for layer in self.packed.layers[2:]:
+            x = layer(x)
+        return [mi.Float(o) for o in x]
+
+    def _vector(self, values: list) -> nn.CoopVec:
+        return nn.CoopVec(*[mi.Float16(v) for v in values] if self.half else values)
 
 
 class TrainedField:
@@ -196,6 +259,8 @@ class TrainedField:
     #: Arrays beside the weights that training changes, as paths of attributes; those of `UNKNOWN` may hold NaN.
     BESIDE: tuple[str, ...] = ()
     UNKNOWN: tuple[str, ...] = ()
+    #: What one set of its weights is.
+    WEIGHTS: type
 
     shape: FieldShape
     current: Weights
@@ -213,6 +278,12 @@ class TrainedField:
         self.current.assign({k: dr.detach(v) for k, v in self.optimizer.items()})
         self.current.order = self.averaged.order  # the same, but known to frozen functions
         self.current.pack()
+
+    def trainable(self) -> Weights:
+        """`current`, made of the optimiser's parameters themselves, so that gradients arrive there."""
+        self.current.assign(self.optimizer)
+        self.current.order = self.averaged.order
+        return self.current
 
     def optimizers(self) -> list:
         """The optimisers that hold the weights being trained."""
@@ -344,7 +415,7 @@ class Field(TrainedField):
     is a view of them for queries, brought up to date by :meth:`sync`.
     """
 
-    KIND = "incident"
+    KIND, WEIGHTS = "incident", Weights
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
         "scale": object, "mean": object,
@@ -366,8 +437,8 @@ class Field(TrainedField):
 
     def reset(self) -> None:
         """Start anew: the weights and the optimiser as they were when the field was made, bit for bit."""
-        self.current = Weights(self.shape, self.seed)
-        self.averaged = Weights(self.shape, self.seed)
+        self.current = self.WEIGHTS(self.shape, self.seed)
+        self.averaged = self.WEIGHTS(self.shape, self.seed)
         self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
         self._attach_optimizer()
         self.steps = 0
@@ -391,11 +462,14 @@ class Field(TrainedField):
 
     def features(self, weights: Weights, x) -> list:
         """:meth:`encode` by any weights of this field's shape."""
+        return weights.start(self._grid_values(weights, x))
+
+    def _grid_values(self, weights: Weights, x) -> list:
         return list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
 
     def output(self, weights: Weights, features: list, w):
         """:meth:`raw` by any weights of this field's shape."""
-        return mi.Color3f(*weights([*features, *encoding.direction(w, self.shape.direction_degree)])) + 1
+        return mi.Color3f(*weights.finish(features, encoding.direction(w, self.shape.direction_degree))) + 1
 
     def answer(self, weights: Weights, features: list, w):
         """:meth:`query` by any weights of this field's shape."""
@@ -410,22 +484,21 @@ class Field(TrainedField):
 
         Call it once per :meth:`step`, before it.
         """
-        self.current.assign(self.optimizer)
-        n = dr.width(x)
-        inputs = [*self.encode(x, averaged=False), *encoding.direction(w, self.shape.direction_degree)]
-        inputs = [i + dr.zeros(mi.Float, n) for i in inputs]  # the constant harmonic is 1-wide
-        out = self.current.mlp(mi.TensorXf(dr.concat(inputs), shape=(self.shape.n_inputs, n)))
-        return mi.Color3f(*(out[i, :].array for i in range(3))) + 1
+        weights = self.trainable()
+        inputs = [*self._grid_values(weights, x), *encoding.direction(w, self.shape.direction_degree)]
+        return mi.Color3f(*weights.differentiable(inputs)) + 1
 
-    def step(self, loss, learning_rate, decay) -> None:
-        """One step of Adam down the gradient of `loss`, a differentiable scalar array; then the averaged copy.
+    def step(self, losses, learning_rate, decay):
+        """One step of Adam down the gradient of the sum of `losses`, a differentiable array; then the averaged copy.
+        Returns the sum.
 
         ``averaged <- decay averaged + (1 - decay) current``: with a `decay` that grows from 0, as the integrators give
-        it, the average is free of bias from its start. A loss that is not finite changes nothing. May be frozen.
+        it, the average is free of bias from its start. A sum that is not finite changes nothing. May be frozen.
         """
-        average = descend(self.optimizer, loss, self.averaged.parameters(), learning_rate, decay)
+        average, loss = descend(self.optimizer, losses, self.averaged.parameters(), learning_rate, decay)
         self.averaged.assign(average)
         self.averaged.pack()
+        return loss
 
     # -------------------------------------------------------------------------------------------------------------
     # State and files

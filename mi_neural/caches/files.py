@@ -15,6 +15,8 @@ FILE_VERSION = 2
 #: What is said of a file that is not of the kind asked for.
 KINDS = {
     "incident": "holds no incident radiance alone; train an incident cache and save it",
+    "spatial_hash": "holds no spatial hash; train and save one with cache='spatial_hash'",
+    "sh_grid": "holds no grid of spherical harmonics; train and save one with cache='sh_grid'",
     "outgoing": "holds no outgoing radiance; train an outgoing cache and save it",
     "pair": "does not hold both incident and outgoing radiance; train and save a cache with termination='auto'",
 }
@@ -73,7 +75,7 @@ def read(path, kind: str, unknown: tuple[str, ...] = ()) -> tuple[dict, dict[str
             f"'{path}' has cache format {version}, this version reads {FILE_VERSION}; train and save it again"
         )
     if found != kind:
-        raise CacheFileError(f"'{path}' {KINDS[kind]}")
+        raise CacheFileError(f"'{path}' {KINDS.get(kind, f'holds no cache of the kind {kind!r}')}")
     if {name: list(values.shape) for name, values in arrays.items()} != header.get("arrays"):
         raise damaged(path, "its arrays are not those that its header says")
     for name, values in arrays.items():

@@ -23,7 +23,7 @@ from ..transport.samples import PathSampler
 from . import encoding, loss
 from .blend import Blend
 from .divergence import StepWatch, healthy
-from .field import Field, FieldShape
+from .field import Field, FieldShape, TrainedField
 from .reliability import Reliability
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
@@ -111,12 +111,13 @@ def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
 
 
 def local_mean(field: Field, features: list, records: TrainingRecords, n: int, sampler):
-    """Mean prediction over the cosine-weighted hemisphere at each record, over `scale`, from `n` queries."""
+    """Mean prediction, by the weights being trained, over the cosine-weighted hemisphere at each record, over `scale`,
+    from `n` queries."""
     frame = mi.Frame3f(mi.Normal3f(records.normal))
 
     def add(i, total, sampler):
         w = frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
-        return i + 1, total + loss.luminance(dr.maximum(field.raw(features, w), 0)), sampler
+        return i + 1, total + loss.luminance(dr.maximum(field.raw(features, w, averaged=False), 0)), sampler
 
     _, total, _ = dr.while_loop(
         (mi.UInt32(0), mi.Float(0), sampler), lambda i, total, sampler: i < n, add, label="local mean"
@@ -134,26 +135,27 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
     with dr.suspend_grad():
         mean_target = dr.sum(loss.luminance(y)) / n_valid
         field.mean = dr.lerp(mean_target, field.mean, decay)
-        sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
-        features = field.encode(records.position)
-        mean_local = local_mean(field, features, records, training.n_local, sampler)
-        averaged = field.query(features, records.direction) if blend else None  # in the kernel that encodes
-        dr.eval(y, mean_local, averaged, field.mean)
+        dr.eval(y, field.mean)
+        averaged = field.query(field.encode(records.position), records.direction) if blend else None
+        dr.schedule(averaged)
 
     p = field.predict(records.position, records.direction)
-    if blend:
-        with dr.suspend_grad():
-            blend.observe(records, y * field.scale, dr.maximum(dr.detach(p), 0) * field.scale, averaged)
+    with dr.suspend_grad():
+        sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
+        features = field.encode(records.position, averaged=False)  # the same look-ups as the prediction's
+        mean_local = local_mean(field, features, records, training.n_local, sampler)
+    said = dr.detach(p)
+    dr.schedule(said)
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
-    total = dr.sum(dr.select(records.valid, error, 0)) / n_valid
-    mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(dr.detach(p))), 0)) / n_valid
-    dr.schedule(mean_prediction)
-    field.step(total, learning_rate, decay)
+    total = field.step(dr.select(records.valid, error, 0) / n_valid, learning_rate, decay)
+    total = dr.select(field.averaged.finite(), total, math.nan)  # queries would hide it
     if blend:
         with dr.suspend_grad():
+            blend.observe(records, y * field.scale, dr.maximum(said, 0) * field.scale, averaged)
             blend.refresh()
-    return dr.detach(total), mean_target, mean_prediction
+    mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(said)), 0)) / n_valid
+    return total, mean_target, mean_prediction
 
 
 class IncidentCache:
@@ -169,8 +171,8 @@ class IncidentCache:
     BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
-    #: What is trained, and what blends its two sets of weights.
-    FIELD, BLEND = Field, Blend
+    #: What is trained, its sizes, and what blends its two sets of weights.
+    FIELD, SHAPE, BLEND = Field, FieldShape, Blend
     #: What the mean weight of the blend is called in the statistics.
     MEASURE = "reliability"
 
@@ -178,7 +180,7 @@ class IncidentCache:
         self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0, *, blend: str = "ema",
         reliability: Reliability | None = None,
     ):  # fmt: skip
-        self.training, self.shape, self.seed = training or Training(), shape or FieldShape(), seed
+        self.training, self.shape, self.seed = training or Training(), shape or self.SHAPE(), seed
         self.blend, self.reliability = blend, reliability
         self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
         self._probe = dr.freeze(self._probe_plain, auto_opaque=False)
@@ -233,9 +235,17 @@ class IncidentCache:
         with dr.suspend_grad():
             records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
             dr.eval(records, n_bad)
-        outputs = learn(cache, records, self.training, seed + 0x9E3779B9, learning_rate, decay)
-        sigma = mi.Float(0) if isinstance(cache, Field) else cache.mean_sigma()
+        outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
+        sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
         return *outputs, dr.count(records.valid), n_bad, sigma
+
+    def make_field(self, low: list, high: list, scale: float):
+        """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""
+        return self.FIELD(low, high, self.shape, scale=scale, seed=self.seed)
+
+    def learn(self, asked, records: TrainingRecords, seed, learning_rate, decay) -> tuple:
+        """One training step of what is `asked` on the records; is frozen. See :func:`learn` for what it returns."""
+        return learn(asked, records, self.training, seed, learning_rate, decay)
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -252,7 +262,7 @@ class IncidentCache:
             scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-30):
             scale = 1e-20  # no indirect light found: the cache answers with nothing
-        self.field = Field(low, high, self.shape, scale=scale, seed=self.seed)
+        self.field = self.make_field(low, high, scale)
         dr.eval(self.field)
 
     def train_frame(self, scene, sensor, lights=None) -> float:

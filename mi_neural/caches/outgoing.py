@@ -34,6 +34,8 @@ TARGET_MAX = 1e4
 EPSILON = 1e-2
 #: Bins of the roughness, encoded as 1 - e^-roughness.
 ROUGHNESS_BINS = 4
+#: What the network can be told of a surface beside its position.
+INPUTS = ("normal", "view", "albedo", "roughness")
 #: Cells along each axis of the box in which training records are counted.
 DENSITY_CELLS = 32
 #: Places that are remembered, and steps after which all earlier ones weigh as much as the next 1000.
@@ -48,12 +50,18 @@ class OutgoingShape(FieldShape):
     analytic function of all inputs, most normals along the axes, squared error after 300 steps: degree 3 for both
     0.139, degree 2 0.163, plain x, y, z 0.169, one-blob of polar angles (4 bins each) 0.180, neither 0.66; their costs
     lie within the noise. Unlike polar angles they have no pole, and floors have their normal at the pole.
+
+    `inputs`: what the network is told of a surface beside its position, any of `INPUTS`.
     """
 
     normal_degree: int = 3
+    inputs: tuple[str, ...] = INPUTS
 
     def __post_init__(self):
         super().__post_init__()
+        object.__setattr__(self, "inputs", tuple(self.inputs))  # files hold lists
+        if unknown := set(self.inputs) - set(INPUTS):
+            raise ValueError(f"unknown inputs: {', '.join(sorted(unknown))}; give some of: {', '.join(INPUTS)}")
         for name in ("direction_degree", "normal_degree"):
             if not 0 <= getattr(self, name) <= 7:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 0..7")
@@ -69,8 +77,13 @@ class OutgoingShape(FieldShape):
 
     @property
     def n_inputs(self) -> int:
-        directions = (self.direction_degree + 1) ** 2 - 1 + (self.normal_degree + 1) ** 2 - 1  # no constants
-        return self.n_levels * self.n_features + directions + 3 + ROUGHNESS_BINS
+        directions = [(degree + 1) ** 2 - 1 for degree in (self.normal_degree, self.direction_degree)]  # no constants
+        sizes = dict(zip(INPUTS, (*directions, 3, ROUGHNESS_BINS), strict=True))
+        return self.n_levels * self.n_features + sum(sizes[name] for name in self.inputs)
+
+    @property
+    def n_first(self) -> int:
+        return self.n_inputs  # every query is at another point
 
 
 def reflectance(albedo):
@@ -173,13 +186,17 @@ class OutgoingField(TrainedField):
         return finite & (dr.squared_norm(n) < 4) & (dr.squared_norm(w) < 4)
 
     def _encode(self, weights: Weights, x, n, w, albedo, roughness) -> list:
-        return [
-            *weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)),
-            *encoding.direction(n, self.shape.normal_degree)[1:],
-            *encoding.direction(w, self.shape.direction_degree)[1:],
-            *dr.clip(albedo, 0, 1),
-            *encoding.one_blob(1 - dr.exp(-dr.maximum(roughness, 0)), ROUGHNESS_BINS),
-        ]
+        encoded = {
+            "normal": lambda: encoding.direction(n, self.shape.normal_degree)[1:],
+            "view": lambda: encoding.direction(w, self.shape.direction_degree)[1:],
+            "albedo": lambda: dr.clip(albedo, 0, 1),
+            "roughness": lambda: encoding.one_blob(1 - dr.exp(-dr.maximum(roughness, 0)), ROUGHNESS_BINS),
+        }
+        values = list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        for name in INPUTS:
+            if name in self.shape.inputs:
+                values += list(encoded[name]())
+        return values
 
     def raw(self, x, n, w, albedo, roughness, averaged: bool = True):
         """The network's output: radiance over albedo and `scale`, not clamped; all inputs must be `usable`."""
@@ -203,11 +220,8 @@ class OutgoingField(TrainedField):
 
     def predict(self, x, n, w, albedo, roughness):
         """What :meth:`raw` gives for the weights being trained, differentiable with respect to them."""
-        self.current.assign(self.optimizer)
-        width = dr.width((x, n, w, albedo, roughness))
-        inputs = [i + dr.zeros(mi.Float, width) for i in self._encode(self.current, x, n, w, albedo, roughness)]
-        out = self.current.mlp(mi.TensorXf(dr.concat(inputs), shape=(self.shape.n_inputs, width)))
-        return mi.Color3f(*(out[i, :].array for i in range(3))) + 1
+        weights = self.trainable()
+        return mi.Color3f(*weights.differentiable(self._encode(weights, x, n, w, albedo, roughness))) + 1
 
     def learn(
         self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,
@@ -244,24 +258,25 @@ class OutgoingField(TrainedField):
             dr.eval(usable, n_bad, x, n, w, albedo, roughness, y, share, able, scale, mean_target)
 
         p = self.predict(x, n, w, albedo, roughness)
+        said = dr.detach(p)
+        dr.schedule(said)
         if watch is not None:
             with dr.suspend_grad():
-                watch(y * scale, dr.maximum(dr.detach(p), 0) * scale, usable)
-        error = dr.sum(dr.select(usable, loss.relative_l2(p, y, epsilon), 0)) * share
-        error = dr.select(able, error, math.nan)
-        mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(dr.detach(p))), 0)) * share
-        dr.schedule(mean_prediction)
-
-        learned = dr.isfinite(dr.detach(error))
-        moves = learned & (smoothing < 1)
+                watch(y * scale, dr.maximum(said, 0) * scale, usable)
+        errors = dr.select(usable, loss.relative_l2(p, y, epsilon), 0) * share
+        errors = dr.select(able, errors, math.nan)
         eta = smoothing * self.eta + (1 - smoothing)
         decay = dr.select(smoothing < 1, smoothing * self.eta / dr.maximum(eta, 1e-30), 1)
-        self.averaged.assign(descend(self.optimizer, error, self.averaged.parameters(), learning_rate, decay))
+        averaged, error = descend(self.optimizer, errors, self.averaged.parameters(), learning_rate, decay)
+        self.averaged.assign(averaged)
         self.averaged.pack()
+        learned = dr.isfinite(error)
+        moves = learned & (smoothing < 1)
+        mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(said)), 0)) * share
         self.eta = dr.select(moves, eta, self.eta)
         self.scale = dr.select(moves, scale, self.scale)
         dr.eval(self.averaged, self.eta, self.scale)
-        return dr.detach(error), mean_target, mean_prediction, n_bad
+        return error, mean_target, mean_prediction, n_bad
 
     # -------------------------------------------------------------------------------------------------------------
     # Where records lie

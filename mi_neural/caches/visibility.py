@@ -90,16 +90,15 @@ class VisibilityField:
         """
         averaged = self.weights.parameters()
         self.weights.assign(self.optimizer)
-        n = dr.width(x)
-        inputs = dr.concat([i + dr.zeros(mi.Float, n) for i in self._encode(x)])
-        inputs = mi.TensorXf(inputs, shape=(self.shape.n_inputs, n))
-        out = self.weights.mlp(inputs)
-        loss = dr.mean(dr.square(_sigmoid(out) - visible).array)
-        averaged = descend(self.optimizer, loss, averaged, learning_rate, decay)
+        out, n = self.weights.differentiable(self._encode(x)), dr.width(x)
+        lane = dr.arange(mi.UInt32, n)
+        errors = [dr.square(_sigmoid(v) - dr.gather(mi.Float, visible.array, lane + k * n)) for k, v in enumerate(out)]
+        losses = sum(errors[1:], errors[0]) * (1 / (n * len(out)))
+        averaged, loss = descend(self.optimizer, losses, averaged, learning_rate, decay)
         self.weights.assign(averaged)
         self.weights.pack()
         dr.eval(self.weights)
-        return dr.detach(loss)
+        return loss
 
 
 def _sigmoid(v):

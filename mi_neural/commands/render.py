@@ -13,6 +13,9 @@ from mi_neural.measure import benchmark, budget, cluster, denoise, environment, 
 from mi_neural.measure import reference as references
 from mi_neural.measure.load import InputError
 
+#: Seconds of training after which `render` writes a first image of one sample a pixel, to be replaced by the final one.
+PREVIEW_SECONDS = 1.0
+
 
 @options.readable
 def render(
@@ -44,6 +47,7 @@ def render(
     """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute.
 
     With --scheduler the cache is trained here, and the workers render the samples.
+    Where a cache trains for long, a first image of one sample a pixel is written after a second of it.
     """
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")
@@ -81,7 +85,7 @@ def render(
     terminal.depth_notes(ref, loaded, [case])
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
-    seconds_pretrain = 0.0
+    seconds_pretrain, seconds_preview, first_image = 0.0, 0.0, None
 
     def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
         row = benchmark.make_row(
@@ -90,11 +94,29 @@ def render(
             environment=environment.describe(), budget_seconds=seconds, pretrain_frames=pretrain,
             seconds_pretrain=seconds_pretrain,
         )  # fmt: skip
-        row.image = str(output)
+        row.image, row.seconds_to_first_image = str(output), first_image or environment.seconds_since_start()
         return row
 
     def keep(so_far: budget.Rendered) -> None:
+        nonlocal first_image
         terminal.write_image(output, describe(so_far, so_far.rgb), so_far.rgb, so_far)
+        first_image = first_image or environment.seconds_since_start()
+
+    def previewed(progress: budget.Progress) -> budget.Progress:
+        """`progress` of training, which also writes a first image once that has gone on for a while."""
+        start = budget.clock()
+
+        def advance(done: float, total: float) -> None:
+            nonlocal seconds_preview
+            progress(done, total)
+            now = budget.clock()
+            if first_image is not None or done >= total or now - start < PREVIEW_SECONDS:
+                return
+            if (so_far := budget.preview(loaded.scene, case.integrator, seed)) is not None:
+                keep(so_far)
+            seconds_preview += budget.clock() - now
+
+        return advance
 
     with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
         if denoise_:
@@ -116,7 +138,7 @@ def render(
         seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
         seconds_first = 0.0
         if seconds is None and not stopped:
-            bars_first = bars("training") if hasattr(case.integrator, "train_first") else None
+            bars_first = previewed(bars("training")) if hasattr(case.integrator, "train_first") else None
             seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
         if stopped:  # the image that can be had at once
             rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
@@ -139,7 +161,7 @@ def render(
             rendered = budget.render_samples(
                 loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
             )
-        rendered.seconds_train += seconds_first
+        rendered.seconds_train += seconds_first - seconds_preview
         image, seconds_denoise = rendered.rgb, 0.0
         if denoise_:
             image, seconds_denoise = denoise.denoise(rendered.rgb, guides)
@@ -154,7 +176,8 @@ def render(
     if save_cache is not None:
         case.integrator.save_cache(str(save_cache))
     terminal.print_rows(repeats.group([row]))
-    terminal.out.print(f"wrote {output}", soft_wrap=True, markup=False)
+    first = f"first image {row.seconds_to_first_image:.1f} s after the start"
+    terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
     if rendered.problem:
         raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {n} samples a pixel")
     if rendered.interrupted:

@@ -103,7 +103,7 @@ class VisibleLights:
         visible = self.field.query(p) if self.field is not None else [mi.Float(1)] * g.n_groups
         weights = []
         for k, kind in enumerate(g.kind):
-            w = importance(_Light(g, mi.UInt32(k), kind), p, n, transmits)
+            w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits)
             weights.append(w * dr.fmax(visible[k], CELL_FLOOR if g.cell[k] else VISIBILITY_FLOOR))
         return weights
 
@@ -136,7 +136,7 @@ class VisibleLights:
 
         def candidate(i, best, within, w_best, w_sum, sampler):
             light, q = self.groups.sample_light(chosen, (i + sampler.next_1d()) * inv_m, active)
-            w = importance(_Light(self.table, light, None, active), si.p, n, transmits) / q
+            w = importance(Columns(self.table, light, None, active), si.p, n, transmits) / q
             w_sum += w
             take = sampler.next_1d() * w_sum < w
             return (i + 1, dr.select(take, light, best), dr.select(take, q, within), dr.select(take, w, w_best), w_sum,
@@ -160,7 +160,7 @@ class VisibleLights:
         return pmf * dr.gather(mi.Float, self.groups.within, index, active)
 
 
-class _Light:
+class Columns:
     """Columns of one light (or group) per lane, as `importance` reads them."""
 
     def __init__(self, columns, index, kind, active=True):

@@ -49,6 +49,7 @@ class Row:
 
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
     of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind.
+    `seconds_to_first_image` counts from the start of the process, compiling included.
     """
 
     scene: str
@@ -84,6 +85,7 @@ class Row:
     split: dict[str, float | None] | None = None
     interrupted: bool = False
     image: str | None = None
+    seconds_to_first_image: float | None = None
     statistics: dict[str, object] = field(default_factory=dict)
     environment: dict[str, object] = field(default_factory=dict)
 

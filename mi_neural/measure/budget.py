@@ -195,6 +195,17 @@ def train_first(scene, integrator, sensor: int = 0, progress: Progress | None = 
     return clock() - start, interrupted
 
 
+def preview(scene, integrator, seed: int = 0, sensor: int = 0) -> Rendered | None:
+    """One sample a pixel with what has been learned so far, the integrator going on as if it had not been asked. None
+    for one that has nothing to learn or whose images grow from call to call."""
+    if not hasattr(integrator, "previewing") or getattr(integrator, "cumulative", False):
+        return None
+    run = _Run(scene, integrator, seed, sensor, None)
+    with integrator.previewing():
+        run.one_pass(1)
+    return replace(run.result(), interrupted=True)
+
+
 def render_samples(
     scene, integrator, spp: int, seed: int = 0, sensor: int = 0, progress: Progress | None = None,
     keep: Callable[[Rendered], None] | None = None,

@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import platform
 import sys
+import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+_IMPORTED = time.monotonic()
 
 #: Distributions whose versions belong to a result; the last one is optional.
 DISTRIBUTIONS = ("mitsuba", "drjit", "numpy", "OpenEXR", "flip-evaluator", "mitsuba-oidn")
@@ -45,6 +48,16 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def seconds_since_start() -> float:
+    """Seconds since this process was started; where the system does not tell, since this module was imported."""
+    try:
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        started = int(fields[19]) / os.sysconf("SC_CLK_TCK")  # field 22: clock ticks after the machine's start
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - started
+    except (OSError, AttributeError, IndexError, ValueError):
+        return time.monotonic() - _IMPORTED
 
 
 def _threads() -> int:

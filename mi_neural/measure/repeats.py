@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .benchmark import Row
-from .metrics import bias_and_variance
+from .metrics import bias_and_variance, relative_squared_errors
 from .reference import Reference
 
 LEVEL = 0.95
@@ -37,7 +37,8 @@ class Group:
     """Rows that differ by their repeat alone, never none, and what their images say together.
 
     `squared_bias` and `variance` are those of one image, relative as in relMSE and trimmed alike; `squared_bias_error`
-    is the first one's standard error, by the jackknife. None: fewer than two repeats (the error: three), no reference.
+    is the first one's standard error: by the jackknife over the repeats, and of the reference as if its noise were
+    normal. None: fewer than two repeats (the error: three), no reference.
     """
 
     rows: list[Row]
@@ -100,4 +101,6 @@ def tell_apart(found: Group, image: Callable[[Row], np.ndarray | None], referenc
         without = [
             bias_and_variance(images[:k] + images[k + 1 :], reference.rgb, reference.variance)[0] for k in range(n)
         ]
-        found.squared_bias_error = float(np.sqrt((n - 1) * np.var(without)))
+        noise = relative_squared_errors(reference.rgb, reference.rgb, reference.variance)[1]
+        of_reference = 2 * np.sum(noise**2) / noise.size**2  # each squared deviation varies by twice its mean squared
+        found.squared_bias_error = float(np.sqrt((n - 1) * np.var(without) + of_reference))

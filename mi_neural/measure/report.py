@@ -194,8 +194,8 @@ def repeats_note(groups: list[Group]) -> str | None:
         f"{n} repeats with independent seeds, of images and of training: figures are means, ± is half of Student's "
         f"{100 * LEVEL:.0f} % confidence interval of the mean. Bias² and variance are those of one image, in sum about "
         "trimmed relMSE. Bias² comes from products of different repeats, so that their noise cancels, less the "
-        "reference's variance; its ± is one standard error over the repeats (jackknife). It is not resolved where it "
-        "is negative, or below the reference's own noise."
+        "reference's variance; its ± is one standard error, over the repeats (jackknife) and of the reference. It is "
+        "not resolved below the reference's own noise in relMSE, as errors are divided by a noisy reference."
     )
 
 

@@ -60,11 +60,13 @@ def sobol_2d(index, seed):
     """Point `index` of the Owen-scrambled (0,2)-sequence number `seed`, order shuffled (Burley 2020, listing 3)."""
     index = _owen(index, seed)
     x = dr.brev(index)
-    # Second dimension: the direction numbers of Sobol's are those of Pascal's triangle modulo 2
-    y, v = mi.UInt32(0), mi.UInt32(0x80000000)
-    for bit in range(16):  # 65,536 samples a pixel before the second coordinate repeats, scrambled anew
-        y = y ^ dr.select((index >> bit) & 1 != 0, v, 0)
-        v = v ^ (v >> 1)
+    # Second dimension: the direction numbers of Sobol's are those of Pascal's triangle modulo 2, so output bit j is the
+    # parity of the input bits k of which j is a bitwise subset (Lucas): four sums over subsets, one for each bit of k.
+    # Sixteen bits: 65,536 samples a pixel before the second coordinate repeats, scrambled anew.
+    y = index & 0xFFFF
+    for shift, mask in ((1, 0xAAAA), (2, 0xCCCC), (4, 0xF0F0), (8, 0xFF00)):
+        y = y ^ ((y & mask) >> shift)
+    y = dr.brev(y)
     return mi.Point2f(_to_unit(_owen(x, _hash(seed ^ 0x68BC21EB))), _to_unit(_owen(y, _hash(seed ^ 0x02E5BE93))))
 
 

@@ -1,0 +1,82 @@
+"""Rows of the keys that all integrators with caches have, for their docstrings."""
+
+from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY
+
+SHARED_KEYS = (
+    """
+     * - max_depth
+       - |int|
+       - Longest *traced* path in segments; -1 means no limit. Up to 2 the result is that of ``path`` (no cache is
+         asked). Beyond, light from the cache has been reflected any number of times: compare with an unlimited
+         ``path``. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth from which Russian roulette may end a traced path. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Leave out what the camera sees of emitters directly. (Default: false)
+     * - train_frames
+       - |int|
+       - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
+     * - train_samples
+       - |int|
+       - Training paths per frame. (Default: 4096)
+     * - train_vertices
+       - |int|
+       - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)
+     * - train_steps
+       - |int|
+       - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
+     * - learning_rate
+       - |float|
+       - Of Adam, at the start; falls to a tenth. (Default: 0.01)
+     * - ema_decay
+       - |float|
+       - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)
+     * - freeze_cache
+       - |bool|
+       - Do not train at all; an untrained cache answers with a constant. (Default: false)
+     * - seed
+       - |int|
+       - Of the initial weights and the training paths. (Default: 0)
+     * - levels
+       - |int|
+       - Levels of the hash grid, two features each. (Default: 8)
+     * - hashmap_size
+       - |int|
+       - Most entries of a level. (Default: 32768)
+     * - width
+       - |int|
+       - Of the network's hidden layers. (Default: 32)
+     * - hidden_layers
+       - |int|
+       - Their number. (Default: 2)
+     * - blend
+       - |string|
+       - Which weights answer. ``ema``: their average, least noise, lags behind changes. ``fast``: those being trained.
+         ``reliability``: (1 - σ) average + σ trained, σ by place from how both agree with the training records; as
+         quick as ``fast`` where light changes, as still as ``ema`` elsewhere. ``switch``: the same with σ rounded to 0
+         or 1. For scenes that change; in still ones ``ema`` is best. (Default: ema)
+     * - reliability
+       - |string|
+       - How σ is found: ``evidence`` (a test whether the trained weights are better), ``correlation``, ``concordance``,
+         ``regression``. (Default: evidence)
+     * - reliability_normals
+       - |bool|
+       - Keep statistics apart by the six main directions of the normal. (Default: false)
+     * - last_rate
+       - |float|
+       - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be
+         quick)
+"""
+    + LIGHT_SAMPLER_KEY.strip("\n")
+    + """
+     * - plan
+       - |string|
+       - What is built. ``scene``: what the scene needs (``mi-neural plan SCENE`` says what and why; keys of this table
+         have the last word). ``everything``: whatever it needs, to compare and to look for faults. (Default: scene)
+     * - channels
+       - |string|
+       - Extra channels to write, a comma-separated list; the plugin says which. (Default: none)
+"""
+)

@@ -1,0 +1,1 @@
+"""The manual: plugins' pages out of their docstrings, and the guides beside this file."""

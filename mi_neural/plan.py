@@ -1,0 +1,455 @@
+"""What a scene needs: facts read off it, and of each part of an estimator whether it is modelled, or left out, and why.
+
+A plan is made once per scene by whoever renders it. Its decisions follow from what cannot change while the scene is
+the same: kinds and numbers of emitters, flags of BSDFs. Where lights are to be chosen it also looks: some thousand
+shadow rays say what each way of choosing them would leave of the noise (:func:`light_noise`). A decision that a key has
+fixed is `given`. In the mode ``everything`` all parts are built that can be, for comparison.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .caches.outgoing import INPUTS
+from .caches.visibility import surface_point
+from .lights.clusters import make_groups
+from .lights.sampling import VISIBILITY_FLOOR, Columns, PowerLights
+from .lights.table import ENVIRONMENT, LOCAL, LightTable, importance
+from .transport.freezing import undisturbed
+from .transport.samples import PathSampler
+
+MODES = ("scene", "everything")
+#: Most outputs of the visibility network; more lights are known by clusters.
+MOST_OUTPUTS = 32
+#: Learned visibility is worth its time where it leaves less than this share of the noise of a choice by power. Shares,
+#: and what was gained in equal time: 0.01 (32 lamps) 5 times, 0.1 (24,576 triangles) 13 times, 0.19 (staircase of 13
+#: lights, frames 1.6 times as long) nothing. And power is worth its own code where it leaves less than the second.
+WORTH_SHARE, WORTH_POWER = 0.15, 0.8
+#: More lights than this are not looked at: a table of them would take seconds and gigabytes unasked.
+MOST_LOOKED_AT = 2**18
+#: Noise of direct light from which on 2, and 4, samples of it are taken per camera sample.
+TWO_SAMPLES, FOUR_SAMPLES = 0.02, 0.08
+#: Points that lights are looked at from.
+N_POINTS = 2048
+
+#: Parts of an environment with an output each, where everything is built.
+EVERY_CELL = 32
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What can be read off a scene without tracing a ray.
+
+    emitters      number of them by kind: area, environment, directional, point (all others without extent)
+    triangles     primitives of emissive meshes
+    lights        what a light sampler chooses among; an emissive mesh of two triangles counts as one light
+    surfaces      shapes by what they reflect: lambertian (diffuse alone), glossy, mixed (diffuse with a mirror or with
+                  holes), mirror (no smooth lobe)
+    textures      shapes with a textured BSDF
+    roughness     least and largest `alpha` of BSDFs that say one; None without
+    film          (width, height) in pixels; None without a sensor
+    extent        longest side of the scene's box, in its unit; None where that is not finite
+    sensors       their number
+    media         whether a shape borders a participating medium
+    """
+
+    emitters: dict[str, int]
+    triangles: int
+    lights: int
+    surfaces: dict[str, int]
+    textures: int
+    roughness: tuple[float, float] | None
+    film: tuple[int, int] | None
+    extent: float | None
+    sensors: int
+    media: bool
+
+    @classmethod
+    def read(cls, scene, sensor) -> SceneFacts:
+        emitters, triangles, lights = {}, 0, 0
+        for emitter in scene.emitters():
+            kind, primitives = _kind(emitter)
+            emitters[kind] = emitters.get(kind, 0) + 1
+            triangles += primitives
+            lights += primitives if primitives > 2 else 1
+        surfaces, textures, alphas, known = {}, 0, [], {}
+        for shape in scene.shapes():
+            bsdf = shape.bsdf()
+            if bsdf is None:
+                continue
+            if bsdf.ptr not in known:
+                known[bsdf.ptr] = _reflects(bsdf), *_parameters(bsdf)
+            kind, textured, found = known[bsdf.ptr]
+            surfaces[kind] = surfaces.get(kind, 0) + 1
+            textures += textured
+            alphas += found
+        box = np.array(scene.bbox().extents(), np.float64).ravel()
+        return cls(
+            emitters, triangles, lights, surfaces, textures, (min(alphas), max(alphas)) if alphas else None,
+            None if sensor is None else tuple(int(n) for n in sensor.film().crop_size()),
+            float(box.max()) if np.isfinite(box).all() else None,
+            len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()),
+        )  # fmt: skip
+
+    @property
+    def environment(self) -> bool:
+        return "environment" in self.emitters
+
+    @property
+    def smooth(self) -> int:
+        """Shapes that a cache can be asked at."""
+        return sum(n for kind, n in self.surfaces.items() if kind != "mirror")
+
+    @property
+    def alike(self) -> bool:
+        """Whether every surface, mirrors apart, reflects the same in all directions."""
+        return self.smooth == self.surfaces.get("lambertian", 0)
+
+
+def _kind(emitter) -> tuple[str, int]:
+    """Kind of an emitter, and the primitives of its mesh (0 where it has none)."""
+    if emitter.is_environment():
+        return "environment", 0
+    shape = emitter.get_shape()
+    if shape is not None:
+        return "area", int(shape.primitive_count()) if shape.is_mesh() else 0
+    if int(emitter.flags()) & int(mi.EmitterFlags.DeltaDirection):
+        return "directional", 0
+    return "point", 0
+
+
+def _reflects(bsdf) -> str:
+    flags, names = int(bsdf.flags()), mi.BSDFFlags
+    if not flags & int(names.Smooth):
+        return "mirror"
+    if flags & int(names.Glossy):
+        return "glossy"
+    return "mixed" if flags & int(names.Delta) else "lambertian"
+
+
+def _parameters(bsdf) -> tuple[bool, list[float]]:
+    """Whether a BSDF is textured, and the values of its `alpha`."""
+    parameters = mi.traverse(bsdf)
+    values = {key: parameters[key] for key in parameters.keys()}
+    textured = {key for key, value in values.items() if dr.is_tensor_v(value)}
+    alphas = [key for key in values if {"alpha", "alpha_u", "alpha_v"} & set(key.split("."))]
+    found = [np.array(values[key], np.float64).ravel() for key in alphas if key not in textured]
+    return bool(textured), [float(v) for values in found for v in values]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Decisions
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What becomes of one part.
+
+    value      what is built: a name, a number, True; False or 0 where nothing is
+    modelled   whether it is built at all
+    because    the reason, with the facts in numbers
+    given      whether a key has fixed it
+    """
+
+    value: object
+    modelled: bool
+    because: str
+    given: bool = False
+
+    def __str__(self):
+        what = "modelled" if self.modelled else "left out"
+        if self.modelled and not isinstance(self.value, bool):
+            what += f": {self.value}"
+        return what + (" (given)" if self.given else "")
+
+
+def modelled(value, because: str) -> Decision:
+    return Decision(value, True, because)
+
+
+def left_out(because: str) -> Decision:
+    return Decision(False, False, because)
+
+
+def given(value, because: str) -> Decision:
+    return Decision(value, bool(value), because, True)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What an integrator, or a light sampler, asks a plan for.
+
+    plugin      its name
+    mode        one of `MODES`
+    given       decisions that keys have fixed, by part
+    caches      of integrators, what they may ask for light: any of ``incident``, ``outgoing``
+    max_depth   of their paths, in segments; -1: no limit
+    blend       see :mod:`.caches.blend`
+    sizes       of the network by default, by part
+    look        gives the :class:`LightNoise` of the scene; None: lights are chosen by the scene, or as given
+    """
+
+    plugin: str
+    mode: str = "scene"
+    given: dict[str, object] = field(default_factory=dict)
+    caches: tuple[str, ...] = ()
+    max_depth: int = -1
+    blend: str = "ema"
+    sizes: dict[str, int] = field(default_factory=dict)
+    look: Callable[[], LightNoise] | None = None
+
+    @property
+    def everything(self) -> bool:
+        return self.mode == "everything"
+
+
+@dataclass
+class ScenePlan:
+    """Facts, and decisions by part. ``plan["clusters"]`` is the value of one; ``print(plan)`` says them all."""
+
+    plugin: str
+    mode: str
+    facts: SceneFacts
+    decisions: dict[str, Decision] = field(default_factory=dict)
+
+    def __getitem__(self, part: str):
+        return self.decisions[part].value if part in self.decisions else False
+
+    def modelled(self, part: str) -> bool:
+        """Whether a part is built; one that the plan does not speak of is not."""
+        return part in self.decisions and self.decisions[part].modelled
+
+    def to_json(self) -> dict:
+        """Plain values."""
+        facts = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self.facts).items()}
+        parts = {part: asdict(d) for part, d in self.decisions.items()}
+        return {"plugin": self.plugin, "mode": self.mode, "facts": facts, "decisions": parts}
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """(part, what becomes of it, why) of each decision, as text."""
+        return [(part, str(d), d.because) for part, d in self.decisions.items()]
+
+    def __str__(self):
+        rows = self.rows()
+        wide = [max((len(r[k]) for r in rows), default=0) for k in (0, 1)]
+        lines = [f"    {part:{wide[0]}}  {what:{wide[1]}}  {why}" for part, what, why in rows]
+        return "\n".join([f"ScenePlan[{self.plugin}, {self.mode}", *lines, "  ]"])
+
+
+def of_integrator(facts: SceneFacts, request: Request) -> ScenePlan:
+    """What an integrator with caches builds in a scene; the parts of its light sampler are in that one's plan."""
+    plan = ScenePlan(request.plugin, request.mode, facts)
+    plan.decisions["cache"] = _cache(facts, request)
+    plan.decisions["light_sampler"] = _light_sampler(facts, request)
+    if "light_samples" in request.given:
+        plan.decisions["light_samples"] = given(request.given["light_samples"], "else by the noise of direct light")
+    if not plan.modelled("cache"):
+        return plan
+    plan.decisions["reliability"] = _reliability(request)
+    if "outgoing" in request.caches:
+        for name in INPUTS:
+            decision = _input(name, facts, request)
+            if name in request.given:
+                decision = given(request.given[name], f"else {decision}: {decision.because}")
+            plan.decisions[name] = decision
+    for name, size in request.sizes.items():
+        plan.decisions[name] = modelled(size, "the same in all scenes (README: measured)")
+        if name in request.given:
+            plan.decisions[name] = given(request.given[name], f"else {size}")
+    return plan
+
+
+def of_sampler(facts: SceneFacts, request: Request) -> ScenePlan:
+    """What a light sampler builds in a scene."""
+    plan = ScenePlan(request.plugin, request.mode, facts)
+    by_visibility, n = request.plugin == "nvc_lights", facts.lights
+    cells = request.given.get("environment_cells", 0)
+    if n > 1 or request.everything:
+        plan.decisions["light_sampler"] = modelled(request.plugin, f"lights: {n}")
+    elif cells and facts.environment:
+        plan.decisions["light_sampler"] = modelled(request.plugin, f"parts of the environment: {cells}")
+    else:
+        plan.decisions["light_sampler"] = left_out(f"nothing to choose, lights: {n}")
+    if not by_visibility or not plan.modelled("light_sampler"):
+        return plan
+
+    most = request.given.get("outputs", MOST_OUTPUTS)
+    clustered = n > most
+    if not request.given.get("visibility", True):
+        plan.decisions["visibility"] = given(False, "lights are chosen by what they would give without shadows")
+    else:
+        each = f"{n} lights in at most {most} clusters" if clustered else f"an output for each light: {n}"
+        plan.decisions["visibility"] = modelled(min(n, most), each)
+    if not clustered:
+        plan.decisions["clusters"] = left_out(f"each light has an output, lights: {n}, outputs: up to {most}")
+    elif "clusters" in request.given:
+        plan.decisions["clusters"] = given(request.given["clusters"], f"{n} lights, {most} outputs")
+    else:
+        plan.decisions["clusters"] = modelled("auto", f"{n} lights, {most} outputs")
+    plan.decisions["environment_cells"] = _environment(facts, request)
+    return plan
+
+
+def _cache(facts: SceneFacts, request: Request) -> Decision:
+    n, known = sum(facts.surfaces.values()), request.given.get("cache", "network")
+    if 0 <= request.max_depth <= 2:
+        return left_out(f"paths of at most {request.max_depth} segments meet no light that was reflected before")
+    if not known:
+        return given(False, "a path tracer")
+    if not facts.smooth and not request.everything:
+        return left_out(f"all of {n} surfaces are mirrors or glass")
+    why = f"{facts.smooth} of {n} surfaces reflect from all around"
+    return given(known, why) if "cache" in request.given else modelled(known, why)
+
+
+def _light_sampler(facts: SceneFacts, request: Request) -> Decision:
+    n = facts.lights
+    if request.everything:
+        return modelled(request.given.get("light_sampler", "nvc_lights"), f"everything; lights: {n}")
+    if "light_sampler" in request.given:
+        return given(request.given["light_sampler"], f"lights: {n}")
+    if n < 2:
+        return left_out(f"nothing to choose, lights: {n}")
+    if request.look is None or n > MOST_LOOKED_AT:
+        return left_out(f"the scene's own choice among {n} lights; nest one to have another")
+    noise = request.look()
+    figures = f"variance of direct light, {n} lights: {noise}"
+    if noise.visibility < WORTH_SHARE * min(noise.power, noise.uniform):
+        return modelled("nvc_lights", figures)
+    if noise.power < WORTH_POWER * noise.uniform:
+        return modelled("power_lights", f"{figures}; visibility would cost what it saves")
+    return left_out(f"{figures}; the scene's uniform choice will do")
+
+
+def _environment(facts: SceneFacts, request: Request) -> Decision:
+    if not facts.environment:
+        return left_out("there is no environment")
+    cells = request.given.get("environment_cells")
+    if cells is not None:
+        return given(cells, "there is an environment")
+    if request.everything:
+        return modelled(EVERY_CELL, "everything; there is an environment")
+    return left_out("visibility by direction costs what it saves (README)")
+
+
+def _reliability(request: Request) -> Decision:
+    if request.blend in ("reliability", "switch"):
+        return modelled(True, f"blend is {request.blend}: two sets of weights are scored by place")
+    if request.blend == "control":
+        return modelled("alpha", "the cache is a control variate: how far it is believed is measured by place")
+    return left_out(f"blend is {request.blend}: one set of weights answers everywhere")
+
+
+def _input(name: str, facts: SceneFacts, request: Request) -> Decision:
+    """Whether the outgoing network is told the `name` of a surface."""
+    if request.everything:
+        return modelled(True, "everything")
+    if name == "normal":
+        return modelled(True, "where surfaces meet, they differ in nothing else")
+    if facts.alike:
+        why = f"all {facts.smooth} surfaces are Lambertian"
+        return left_out(f"{why}, and light over reflectance is learned" if name == "albedo" else why)
+    glossy, span = facts.surfaces.get("glossy", 0), facts.roughness
+    if name == "roughness":
+        if not glossy:
+            return left_out("no surface is glossy")
+        how = f", alpha {span[0]:.3g} to {span[1]:.3g}" if span else ""
+        return modelled(True, f"glossy surfaces: {glossy}{how}")
+    others = facts.smooth - facts.surfaces.get("lambertian", 0)
+    return modelled(True, f"{others} of {facts.smooth} surfaces are not Lambertian")
+
+
+def light_samples(noise: float) -> Decision:
+    """How many samples of direct light a camera sample has, by the relative variance of one."""
+    n = 1 if noise < TWO_SAMPLES else 2 if noise < FOUR_SAMPLES else 4
+    return modelled(n, f"variance of direct light {noise:.2g} (2 samples from {TWO_SAMPLES}, 4 from {FOUR_SAMPLES})")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What choosing lights is worth
+
+
+@dataclass(frozen=True)
+class LightNoise:
+    """Relative variance that the choice of a light adds to direct light, over surfaces that the camera sees and those
+    one bounce further: chosen uniformly, by power, and by what is visible (infinite where that cannot be done)."""
+
+    uniform: float
+    power: float
+    visibility: float
+
+    def __str__(self):
+        return f"{self.uniform:.2g} chosen uniformly, {self.power:.2g} by power, {self.visibility:.2g} by visibility"
+
+
+def light_noise(scene, sensor, n_points: int = N_POINTS, n_rays: int = 4, seed: int = 0) -> LightNoise:
+    """Look at all lights, or clusters of them, from `n_points` points along `n_rays` shadow rays each.
+
+    With unshadowed contributions E and visible shares V of the lights at a point, a choice with probabilities p has the
+    variance ``sum E² V / p - (sum E V)²``; it is taken relative to the squared sum of all light, as in relMSE, and
+    averaged without the largest 0.1 %. Learned visibility chooses by E max(V, floor). The environment has no part in
+    the variance: BSDF rays find it as well.
+    """
+    with dr.suspend_grad(), undisturbed():
+        table = LightTable(scene)
+        far = int((table.columns["kind"] != LOCAL).sum())  # never clustered
+        groups = make_groups(table, max(MOST_OUTPUTS, far + 1), "auto", seed)
+        k, n = groups.n_groups, n_points
+        lane = dr.arange(mi.UInt32, n)
+        sampler = PathSampler.make(lane, mi.UInt32(seed), index=lane, scramble=mi.UInt32(seed))
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, sampler.stratified_2d(0), sampler.next_2d())
+        p, normal, found = surface_point(scene, mi.Ray3f(ray.o, ray.d), mi.Bool(True))
+        wo = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+        beyond, normal_beyond, further = surface_point(scene, mi.Ray3f(p, wo), found & (lane % 2 == 1))
+        p = mi.Point3f(dr.select(further, beyond, p))
+        normal = mi.Vector3f(dr.select(further, normal_beyond, normal))
+        dr.eval(p, normal, found)
+
+        lane = dr.arange(mi.UInt32, n * k)
+        point, group = lane % n, lane // n
+        x = dr.gather(mi.Point3f, p, point)
+        kind = dr.gather(mi.UInt32, mi.UInt32(groups.kind), group)
+        unshadowed = importance(Columns(groups, group, kind), x, dr.gather(mi.Vector3f, normal, point), mi.Bool(False))
+        sampler = PathSampler.make(lane, mi.UInt32(seed + 1))
+
+        def look(i, seen, sampler):
+            light = groups.sample_light(group, sampler.next_1d(), mi.Bool(True))[0]
+            shadow, some = table.shadow_ray(scene, x, light, sampler.next_2d(), mi.Bool(True))
+            return i + 1, seen + dr.select(some & scene.ray_test(shadow, some), 0, mi.Float(1)), sampler
+
+        _, seen, _ = dr.while_loop(
+            (mi.UInt32(0), dr.zeros(mi.Float, n * k), sampler), lambda i, *_: i < n_rays, look, label="lights seen"
+        )
+        dr.eval(unshadowed, seen)
+    found = np.array(found)
+    e = np.array(unshadowed, np.float64).reshape(k, n)[:, found]
+    v = np.array(seen, np.float64).reshape(k, n)[:, found] / n_rays
+
+    label = groups.host["label"]
+    uniform = np.bincount(label) / len(label)
+    power = np.bincount(label, np.array(PowerLights(table).groups.within, np.float64))
+    visible = e * np.maximum(v, VISIBILITY_FLOOR)
+    counts = np.array(groups.kind) != ENVIRONMENT
+    noise = [_variance(e, v, pmf, counts) for pmf in (uniform[:, None], power[:, None], visible)]
+    return LightNoise(*noise[:2], noise[2] if far < MOST_OUTPUTS else math.inf)
+
+
+def _variance(e: np.ndarray, v: np.ndarray, pmf: np.ndarray, counts: np.ndarray) -> float:
+    """Mean relative variance of one light chosen by `pmf`, not normalised; arrays (lights, points). Only lights that
+    `counts` names have a part in it."""
+    total = (e * v).sum(axis=0)
+    if not (total > 0).any():
+        return 0.0
+    level = np.median(total[total > 0])  # points on a lamp itself are brighter by far
+    pmf = np.broadcast_to(pmf, e.shape)
+    pmf = (pmf / np.maximum(pmf.sum(axis=0), 1e-300))[counts]
+    e, v = e[counts], v[counts]
+    second = np.divide(e**2 * v, pmf, out=np.zeros_like(e), where=pmf > 0).sum(axis=0)
+    relative = np.sort((second - (e * v).sum(axis=0) ** 2) / (total**2 + 1e-2 * level**2))
+    return float(max(relative[: max(1, int(0.999 * relative.size))].mean(), 0.0))
