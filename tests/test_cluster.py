@@ -166,6 +166,18 @@ def setup_of(integrator: str = "path") -> tuple[jobs.Setup, load.LoadedScene, be
     return jobs.Setup.of(loaded, case, SIZE), loaded, case
 
 
+def test_integrator_that_was_frozen_for_parts_is_not_the_one_that_is_measured():
+    setup, _, _ = setup_of(NIRC)
+    workbench = jobs.Workbench()
+    loaded, case = workbench.ready(setup)
+    workbench.learned(None)
+    assert case.integrator.freeze_cache and workbench.ready(setup)[1] is case
+    again, fresh = workbench.ready(setup, fresh=True)
+    assert again is loaded and not fresh.integrator.freeze_cache
+    other = replace(setup, keys=setup.keys | {"cache_samples": 1})
+    assert workbench.ready(other)[0] is loaded and workbench.ready(replace(setup, size=(8, 8)))[0] is not loaded
+
+
 @pytest.mark.parametrize("spp", [1, 5, 64, 100])
 def test_parts_hold_every_pass_once_whatever_their_number(spp):
     setup, loaded, _ = setup_of()
