@@ -166,6 +166,18 @@ def setup_of(integrator: str = "path") -> tuple[jobs.Setup, load.LoadedScene, be
     return jobs.Setup.of(loaded, case, SIZE), loaded, case
 
 
+def test_integrator_that_was_frozen_for_parts_is_not_the_one_that_is_measured():
+    setup, _, _ = setup_of(NIRC)
+    workbench = jobs.Workbench()
+    loaded, case = workbench.ready(setup)
+    workbench.learned(None)
+    assert case.integrator.freeze_cache and workbench.ready(setup)[1] is case
+    again, fresh = workbench.ready(setup, fresh=True)
+    assert again is loaded and not fresh.integrator.freeze_cache
+    other = replace(setup, keys=setup.keys | {"cache_samples": 1})
+    assert workbench.ready(other)[0] is loaded and workbench.ready(replace(setup, size=(8, 8)))[0] is not loaded
+
+
 @pytest.mark.parametrize("spp", [1, 5, 64, 100])
 def test_parts_hold_every_pass_once_whatever_their_number(spp):
     setup, loaded, _ = setup_of()
@@ -271,6 +283,22 @@ def test_frames_of_two_workers_are_those_of_one_process(address, tmp_path, integ
     assert means == sorted(means, reverse=True) and means[-1] < 0.8 * means[0]
     # Two trainings differ by the order in which records are summed
     np.testing.assert_allclose(found, known, rtol=1e-5 if integrator == "path" else 0.05, atol=1e-3)
+
+
+def test_cases_are_measured_by_the_workers(address, tmp_path, monkeypatch):
+    """All integrators of all scenes, both repeats; each row says where."""
+    monkeypatch.chdir(tmp_path)
+    command = ["compare", "cornell_box", "lit_cube", "-i", "path", "-i", "direct", "--seconds", "0.1", "--repeats",
+               "2", "--size", "16x16", "--reference-spp", "32", "--reference-cache", "kept", "-o", "out"]  # fmt: skip
+    done = CliRunner().invoke(app, [*command, "--scheduler", address])
+    assert done.exit_code == 0, done.output
+    assert "4 cases on 2 workers" in done.output
+    rows = [row for row in json.loads(Path("out/results.json").read_text())["rows"] if row["mode"] == "one-shot"]
+    found = {(row["scene"], row["label"], row["repeat"]) for row in rows}
+    assert len(found) == len(rows) == 8 and {row["scene"] for row in rows} == {"cornell_box", "lit_cube"}
+    assert len({row["environment"]["worker"] for row in rows}) == 2
+    assert all(row["environment"]["threads"] == 1 and row["relmse"] >= 0.0 and row["spp"] >= 1 for row in rows)
+    assert "</html>" in Path("out/report.html").read_text()
 
 
 # ---------------------------------------------------------------- what goes wrong is one line

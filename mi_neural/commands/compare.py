@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, collection, denoise, load, report, suite, terminal
+from mi_neural.measure import benchmark, cluster, collection, denoise, load, report, suite, terminal
 from mi_neural.measure.load import InputError
 
 DEFAULT_SECONDS = "1,2,4,8"
@@ -62,6 +62,7 @@ def compare(
     ] = None,
     denoise_: options.Denoise = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
+    scheduler: options.Scheduler = None,
 ) -> None:
     """Integrators at equal time: report.html, tables, results.json and .csv, images. Ctrl-C keeps what is done.
 
@@ -107,8 +108,8 @@ def compare(
         terminal.require_folder(reference_cache)
 
     terminal.set_variant(variant)
-    with terminal.Bars() as bars:
-        comparison = suite.Suite(files, settings, output, bars)
+    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
+        comparison = suite.Suite(files, settings, output, bars, workers)
         comparison.run()
     found = comparison.report(shlex.join(["mi-neural", *sys.argv[1:]]))
     if not found.scenes:
@@ -126,5 +127,7 @@ def compare(
     for note in found.notes + (found.scenes[0].notes if len(found.scenes) == 1 else []):
         terminal.out.print(note, soft_wrap=True, markup=False)
     terminal.out.print(f"wrote {output / 'report.html'}", soft_wrap=True, markup=False)
+    if comparison.problem:
+        raise InputError(f"{comparison.problem}; the same command goes on from here")
     if comparison.interrupted:
         raise KeyboardInterrupt("interrupted: the same command goes on from here")

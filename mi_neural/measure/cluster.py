@@ -81,7 +81,7 @@ def _renderer(threads: int) -> ThreadPoolExecutor:
 def work(job, packed: bytes | None = None) -> Answer:
     """Run a job, with the pickled data that comes with it, on the worker that this is called on.
 
-    What the user can mend comes back as one line.
+    What goes wrong comes back as one line.
     """
     from distributed import get_worker
 
@@ -94,8 +94,10 @@ def work(job, packed: bytes | None = None) -> Answer:
 
     try:
         return _renderer(worker.state.nthreads).submit(run).result()
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        raise JobError(f"worker {name}: {one_line(error)}") from None
+    except Exception as error:
+        expected = isinstance(error, (ValueError, OSError, ImportError, RuntimeError))
+        text = one_line(error) if expected else f"{type(error).__name__}: {one_line(error)}"
+        raise JobError(f"worker {name}: {text}") from error
 
 
 def _by_value() -> Callable:
@@ -176,7 +178,7 @@ class Workers:
 
         Yields (index, answer) as they are done, in any order; a job that failed gives its error. A job whose worker
         dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun.
-        Raises :class:`ClusterError`: a job took several workers with it, no worker or no scheduler is there any more.
+        Raises :class:`ClusterError`: a job lost several workers, no worker or no scheduler is there any more.
         """
         waiting, finished, call = deque(range(len(jobs_and_data))), queue.SimpleQueue(), _by_value()
         running: dict[object, tuple[int, str]] = {}  # future -> job, worker

@@ -102,26 +102,34 @@ class Setup:
 
 
 class Workbench:
-    """The scene and the integrator of the last job of this process."""
+    """The scene and the integrator of the last job of this process.
+
+    setup     what they were made from; None: the integrator is not there (any more)
+    of_scene  what the scene was made from
+    """
 
     def __init__(self) -> None:
         self.setup: Setup | None = None
+        self.of_scene: Setup | None = None
         self.loaded: LoadedScene | None = None
         self.case: benchmark.Case | None = None
         self.cache: bytes | None = None
         self.sequence: Sequence | None = None
         self.sequence_facts: tuple | None = None
 
-    def ready(self, setup: Setup) -> tuple[LoadedScene, benchmark.Case]:
-        """Scene and integrator of a setup; those of the last one as far as they are the same."""
+    def ready(self, setup: Setup, fresh: bool = False) -> tuple[LoadedScene, benchmark.Case]:
+        """Scene and integrator of a setup; those of the last one as far as they are the same.
+
+        `fresh`: an integrator that has not rendered, learned or been told not to learn anything.
+        """
         import mitsuba as mi
 
-        if setup == self.setup and self.case.integrator is not None:
+        if setup == self.setup and not fresh:
             return self.loaded, self.case
         setup.check()
-        same_scene = self.setup is not None and setup.own is self.setup.own is False
-        same_scene = same_scene and setup == replace(self.setup, spec=setup.spec, keys=setup.keys)
-        self.setup = self.case = self.cache = None
+        same_scene = self.of_scene is not None and not (setup.own or self.of_scene.own)
+        same_scene = same_scene and setup == replace(self.of_scene, spec=setup.spec, keys=setup.keys)
+        self.setup = self.of_scene = self.case = self.cache = None
         if not same_scene:
             # Gone before the next one is loaded: all emitters that are alive are compiled into every kernel
             self.loaded = self.sequence = self.sequence_facts = None
@@ -139,7 +147,7 @@ class Workbench:
         else:
             integrator, keys = build_integrator(IntegratorSpec(setup.spec.type, setup.keys))
             self.case = benchmark.Case(setup.spec, integrator, keys)
-        self.setup = setup
+        self.setup = self.of_scene = setup
         return self.loaded, self.case
 
     def learned(self, cache: bytes | None, over_time: Sequence | None = None) -> None:
@@ -250,7 +258,8 @@ class Measurement:
         reference, guides = given
         if guides is not None:
             denoise.require()
-        loaded, case = workbench.ready(self.setup)
+        loaded, case = workbench.ready(self.setup, fresh=True)
+        workbench.setup = None  # the bench trains the integrator, and lets go of it
         pictures: list[benchmark.Picture] = []
         bench = benchmark.Bench(loaded, reference, guides, environment.describe(), pictures.append)
         bench.run([case], self.plan)

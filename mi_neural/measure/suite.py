@@ -9,7 +9,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import benchmark, collection, denoise, environment, exr, kept, load, page, repeats, report, terminal
+from . import (
+    benchmark,
+    cluster,
+    collection,
+    denoise,
+    environment,
+    exr,
+    jobs,
+    kept,
+    load,
+    page,
+    repeats,
+    report,
+    terminal,
+)
 from . import reference as references
 from .load import InputError
 
@@ -48,15 +62,32 @@ class Settings:
         return len(self.specs) * (len(self.plan.seconds) + steady) * (2 if self.denoise else 1)
 
 
+@dataclass
+class _Later:
+    """A case that the workers will measure, with what all cases of its scene are given, and what takes the rows."""
+
+    job: jobs.Measurement
+    given: tuple[references.Reference, denoise.Guides | None]
+    scene: str
+    keep: Callable[[benchmark.Picture], None]
+
+
 class Suite:
     """Compares on one scene after another. Each has its folder, a single one `folder` itself.
 
     An interruption marks the rendering under way, what was done before is reported, and the same settings go on from
     there. Of several scenes, one that cannot be loaded is left out, and so is an integrator that cannot render it;
-    `notes` say so.
+    `notes` say so. With `workers` all cases of all scenes are measured by these, each by one of them and none beside
+    another; references and the denoiser's guides are rendered here. `problem` says why not all of it was done.
     """
 
-    def __init__(self, files: list[Path], settings: Settings, folder: Path, bars: Callable) -> None:
+    def __init__(
+        self, files: list[Path], settings: Settings, folder: Path, bars: Callable,
+        workers: cluster.Workers | None = None,
+    ) -> None:  # fmt: skip
+        self.workers, self.problem = workers, ""
+        self._later: list[_Later] = []
+        self._grouped: list[Callable[[], None]] = []
         self.files, self.settings, self.folder, self.bars = files, settings, folder, bars
         self.results: list[report.SceneResult] = []
         self.notes: list[str] = []
@@ -81,6 +112,35 @@ class Suite:
                     raise
                 self._leave_out(name, error)
             gc.collect()
+        try:
+            self._by_workers()
+        except KeyboardInterrupt:
+            self.interrupted = True
+        except cluster.ClusterError as error:
+            if len(self.files) == 1 and isinstance(error, cluster.JobError):
+                raise
+            self.interrupted, self.problem = True, str(error)
+        finally:
+            for group in self._grouped:
+                group()
+
+    def _by_workers(self) -> None:
+        """Have the workers measure what was left to them."""
+        if not self._later:
+            return
+        workers, todo = terminal.counted(self.workers.count(), "worker"), len(self._later)
+        bar = self.bars(f"{terminal.counted(todo, 'case')} on {workers}")
+        for done, (index, answer) in enumerate(self.workers.map([(case.job, case.given) for case in self._later])):
+            case = self._later[index]
+            if isinstance(answer, cluster.JobError):
+                if len(self.files) == 1:
+                    raise answer
+                self._leave_out(f"{case.job.setup.spec.label} on {case.scene}", answer)
+                continue
+            for picture in answer.value:
+                picture.row.scene, picture.row.environment["worker"] = case.scene, answer.worker
+                case.keep(picture)
+            bar(done + 1, todo)
 
     def report(self, command: str) -> report.Report:
         """What was found so far."""
@@ -114,12 +174,19 @@ class Suite:
         notes = terminal.depth_notes(reference, loaded, cases) + terminal.notes(reference, settings.denoise)
         found = report.SceneResult(name, loaded.size, [], [], reference.facts(), notes)
         self.results.append(found)
-        try:
-            self._measure(loaded, cases, reference, found, folder)
-        finally:
+
+        def group() -> None:
             found.groups = repeats.group(found.rows)
             for of_kind in found.groups if settings.plan.repeats > 1 else []:
                 repeats.tell_apart(of_kind, lambda row: row.image and exr.read(folder / row.image).rgb, reference)
+
+        try:
+            self._measure(loaded, cases, reference, found, folder)
+        finally:
+            if self.workers is None:
+                group()
+            else:
+                self._grouped.append(group)
 
     def _measure(
         self, loaded: load.LoadedScene, cases: list[benchmark.Case], reference: references.Reference,
@@ -153,8 +220,14 @@ class Suite:
         if guides:
             seconds = f"{guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp)"
             found.notes.append(f"The guides took {seconds}, counted for nobody.")
+        given = reference, guides
         bench = benchmark.Bench(loaded, reference, guides, environment.describe(), keep, self.bars, done)
         for case in cases:
+            if self.workers is not None:
+                if not bench.recall(case, plan):
+                    setup = jobs.Setup.of(loaded, case, loaded.size if settings.sizes else None)
+                    self._later.append(_Later(jobs.Measurement(setup, plan), given, found.name, keep))
+                continue
             try:
                 bench.run([case], plan)
             except (ValueError, RuntimeError) as error:
