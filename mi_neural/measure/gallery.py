@@ -169,7 +169,7 @@ def write_animation(frames: list[np.ndarray], path: Path) -> None:
 
 
 def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
-    """A sheet of all comparisons, pictures made as high as the lowest, PER_ROW to a row, as WebP, whole or not at all."""
+    """A sheet of all comparisons, PER_ROW pictures to a row and as high as the lowest, as WebP, whole or not at all."""
     from PIL import Image
 
     height = min(picture.shape[0] for row in rows for picture in row)
