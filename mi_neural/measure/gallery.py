@@ -2,7 +2,7 @@
 
 Every folder in DIR that holds a `results.json` becomes a section of `DIR/index.html`: pictures, error maps, what each
 cost, and the command that makes it; the frames of a sequence become an animation. ``--compact FILE.webp`` also writes
-the pictures as one sheet, a row a comparison, ``--animation FILE.webp`` the animation of the first sequence.
+the pictures as one sheet, ``--animation FILE.webp`` the animation of the first sequence.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from .sequence import frame_path
 
 #: Frames a second of animations; what WebP may lose of them and of sheets (100: nothing).
 RATE, MOVING_QUALITY, SHEET_QUALITY = 12, 60, 85
+#: Pictures side by side on a sheet.
+PER_ROW = 4
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; color: #222 }
@@ -167,7 +169,7 @@ def write_animation(frames: list[np.ndarray], path: Path) -> None:
 
 
 def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
-    """A sheet with a row a comparison, all pictures made as high as the lowest, as WebP, whole or not at all."""
+    """A sheet of all comparisons, PER_ROW pictures to a row and as high as the lowest, as WebP, whole or not at all."""
     from PIL import Image
 
     height = min(picture.shape[0] for row in rows for picture in row)
@@ -175,7 +177,7 @@ def _write_sheet(rows: list[list[np.ndarray]], path: Path) -> None:
     for row in rows:
         images = [Image.fromarray(p).resize((round(p.shape[1] * height / p.shape[0]), height), Image.Resampling.BOX)
                   for p in row]  # fmt: skip
-        strips.append(montage([np.asarray(image) for image in images], len(images)))
+        strips.append(montage([np.asarray(image) for image in images], min(PER_ROW, len(images))))
     width = max(strip.shape[1] for strip in strips)
     padded = [np.pad(s, ((0, 4), (0, width - s.shape[1]), (0, 0)), constant_values=255) for s in strips]
     with exr.replacing(path) as temporary:
