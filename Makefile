@@ -7,7 +7,7 @@ STAMP  := $(VENV)/mi_neural.stamp
 TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture bench gallery gallery-pictures docs notebooks test stress lint clean
+.PHONY: help demo picture bench gallery gallery-pictures docs notebooks test test-notebooks stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -70,6 +70,9 @@ docs: pyproject.toml | $(STAMP)  ## the manual as HTML: out/docs/index.html
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(TESTS)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-notebooks: $(TESTS)  ## every notebook, shortened, two minutes
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m notebooks tests/test_notebooks.py
 
 stress: $(TESTS)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
 	$(BIN)/python tests/stress.py -o out/stress

@@ -6,6 +6,7 @@ The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest
 import gc
 import os
 import random
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,11 @@ import mi_neural  # isort: skip  (second: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
 import numpy as np
 import pytest
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # As shells start what runs in the background. Mitsuba 3.9.1 passes a SIGINT on to whatever handler was there before
+    # its own: with "ignore", an invalid address
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 VARIANT = os.environ.get("MI_NEURAL_TEST_VARIANT", "llvm_ad_rgb")
 ROOT = Path(__file__).resolve().parents[1]

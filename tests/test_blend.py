@@ -201,7 +201,7 @@ def mean_error(images, known):
     return np.abs(np.array([i.mean() for i in images]) - known).mean() / known
 
 
-@pytest.mark.parametrize("plugin", INTEGRATORS)
+@pytest.mark.parametrize("plugin", ["nirc", pytest.param("nrc", marks=pytest.mark.slow)])
 def test_blend_follows_a_light_as_quickly_as_fast_and_keeps_still_as_the_average(plugin):
     """The light of the sphere becomes a quarter after 160 frames; what the cache holds of the image must follow."""
     after, still = {}, {}

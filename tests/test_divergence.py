@@ -102,7 +102,7 @@ def truths(place):
     return of
 
 
-@pytest.mark.parametrize("kind", ["incident", *(pytest.param(k, marks=SLOW) for k in ("outgoing", "visibility"))])
+@pytest.mark.parametrize("kind", ["visibility", *(pytest.param(k, marks=SLOW) for k in ("incident", "outgoing"))])
 def test_rate_a_hundred_times_too_high_is_recovered_from_within_twenty_steps(kind, place, truths):
     truth, healthy_error = truths(kind)
     run, latest = KINDS[kind](place, 100.0), 0

@@ -106,6 +106,7 @@ def test_image_is_that_of_path(place, kind, name):
 # ---------------------------------------------------------------- predicted direct light in deep bounces
 
 
+@pytest.mark.slow
 def test_direct_light_predicted_deep_down_is_nearly_that_of_path(place):
     """A preview: within 15 % of the mean; without shadows the indirect half would be off by half."""
     scene, path = place("32", 3)
@@ -369,7 +370,9 @@ def test_table_is_made_once_where_no_light_changes():
         assert sampler.lights(scene, scene.sensors()[0]).table is table
 
 
-@pytest.mark.parametrize("key", ["window.emitter.radiance.value", "spark.intensity.value"])
+@pytest.mark.parametrize("key", [
+    pytest.param("window.emitter.radiance.value", marks=pytest.mark.slow), "spark.intensity.value",
+])  # fmt: skip
 def test_light_that_is_dimmed_is_not_recorded_anew(key):
     """NumPy's memory, aligned by chance, must not reach frozen functions."""
     scene, params = shadow_scene(), None

@@ -43,6 +43,7 @@ def test_there_are_nine():
 # ---------------------------------------------------------------- run
 
 
+@pytest.mark.notebooks
 @each
 def test_runs_from_top_to_bottom(file, tmp_path, monkeypatch):
     """Shortened, in a fresh kernel and an empty folder: no cell fails, and nothing is left in the folder."""
