@@ -376,7 +376,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
             for k in range(7):
                 dr.sync_thread()
                 t0 = time.perf_counter()
-                dr.eval(run(field, dr.opaque(mi.UInt32, k)))
+                with undisturbed():
+                    dr.eval(run(field, dr.opaque(mi.UInt32, k)))
                 dr.sync_thread()
                 times.append(time.perf_counter() - t0)
         self.state.ns_per_query = float(np.median(times[2:])) / (n * self.PROBES) * 1e9

@@ -54,6 +54,11 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         self.mixed = progressive.Mixed(self, props) if self.mode == "progressive" else None
 
     @property
+    def CHOOSES_LIGHTS(self) -> bool:
+        """Lights are chosen as the plan says, but where it is path tracing by its keys."""
+        return self.choice.may_ask or self.mixed is not None
+
+    @property
     def needs_cache(self) -> bool:
         return super().needs_cache and (self.choice.may_ask or self.mixed is not None)
 

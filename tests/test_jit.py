@@ -172,3 +172,35 @@ def test_old_scenes_collected_while_a_pass_is_recorded_do_no_harm(run_python):
         print("done")
     """
     assert run_python(code).stdout.splitlines()[-1] == "done"
+
+
+GARBAGE = """
+import gc, drjit as dr, mi_neural, mitsuba as mi, numpy as np
+mi.set_variant(VARIANT)
+from mi_neural import scenes
+scene = mi.load_file(str(scenes.path("point_lit_sphere")), resx=8, resy=8)
+integrator = mi.load_dict({"type": "nirc", "train_samples": 256, "train_frames": 2, "train_steps": 1, "levels": 4})
+
+class Loop:
+    pass
+
+def litter():
+    for _ in range(200):
+        loop = Loop()
+        loop.me, loop.array = loop, mi.Float(np.ones(64, np.float32))
+
+def collect(phase, info):
+    if phase == "stop":
+        litter()
+
+gc.callbacks.append(collect)
+gc.set_threshold(1)
+litter()
+mi.render(scene, integrator=integrator, spp=2)
+assert integrator.measure_query(2**10) > 0
+"""
+
+
+def test_garbage_is_not_collected_while_something_is_recorded(run_python, variant):
+    """What wraps memory of NumPy, freed by a collection while Dr.Jit records, ends the process. In one of its own."""
+    run_python(GARBAGE.replace("VARIANT", repr(variant)))

@@ -26,6 +26,8 @@ from statistics import median
 
 import numpy as np
 
+from mi_neural.transport.freezing import undisturbed
+
 from . import budget, environment, exr, load, memory, split
 
 #: Frames that are measured, after those in which functions are recorded.
@@ -76,7 +78,8 @@ def network_seconds(weights) -> float:
         return dr.while_loop((mi.UInt32(0), mi.Float(0) + zero), lambda i, _: i < REPEATS, evaluate)[1]
 
     def once():
-        dr.eval(run(weights, inputs, dr.opaque(mi.Float, 0)))
+        with undisturbed():
+            dr.eval(run(weights, inputs, dr.opaque(mi.Float, 0)))
         dr.sync_thread()
 
     with dr.suspend_grad():
