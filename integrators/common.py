@@ -130,7 +130,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             training = Training(
                 n_paths=props.get("train_samples", 4096),
                 n_vertices=props.get("train_vertices", 8),
-                learning_rate=props.get("learning_rate", 1e-2),
+                learning_rate=props.get("learning_rate", self.default_rate(blend)),
                 ema_decay=props.get("ema_decay", 0.99),
                 last_rate=props.get("last_rate", 0.1 if blend == "ema" or "blend" not in props else 1.0),
             )
@@ -173,6 +173,10 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def default_blend(self, props) -> str:
         """Which weights answer where no key says it."""
         return "ema"
+
+    def default_rate(self, blend: str) -> float:
+        """The learning rate where no key says it."""
+        return Training.learning_rate
 
     def settle(self, scene, sensor) -> None:
         """Measure, once per scene, what settings depend on; results go to ``state.facts``."""

@@ -29,7 +29,9 @@ SHARED_KEYS = (
        - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
      * - learning_rate
        - |float|
-       - Of Adam, at the start; falls to a tenth. (Default: 0.01)
+       - Of Adam, at the start; falls to a tenth. With ``termination="auto"`` it is that of the integrator's own cache,
+         and the outgoing one learns at three times the rate of the incident one. (Default: 0.01, ``nrc`` 0.03, but
+         0.01 with a ``blend`` other than ``ema``)
      * - ema_decay
        - |float|
        - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)

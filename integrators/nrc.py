@@ -1,6 +1,7 @@
 """``nrc``: paths that end in a neural outgoing radiance cache."""
 
 import math
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -8,7 +9,7 @@ import mitsuba as mi
 from mi_neural import plan
 from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.field import CacheFileError
-from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape, OutgoingTraining
+from mi_neural.caches.outgoing import RATE, OutgoingCache, OutgoingShape, OutgoingTraining
 from mi_neural.caches.pair import PairCache
 from mi_neural.integrators import automatic, prefix
 from mi_neural.integrators.automatic import AUTO
@@ -49,8 +50,9 @@ class NRCIntegrator(CacheIntegrator):
             "content": self.content,
             "suffix": props.get("train_suffix", "spread"),
             "world_share": props.get("world_share", 0.25),
-            "unbounded_share": props.get("unbounded_share", 1 / 16),
+            "unbounded_share": props.get("unbounded_share", OutgoingTraining.unbounded_share),
             "roughening": props.get("roughening", 0.0),
+            "learning_rate": self.cache.training.learning_rate,
         }
         shared, sizes = self.cache.training, self.cache.shape
         try:
@@ -62,7 +64,8 @@ class NRCIntegrator(CacheIntegrator):
             raise ValueError(f"{self.plugin}: {message}") from None
         if self.termination == "auto":
             automatic.check(self)
-            self.cache = PairCache(training, shared, sizes, self.seed)
+            incident = replace(shared, learning_rate=shared.learning_rate / RATE)
+            self.cache = PairCache(training, incident, sizes, self.seed)
         else:
             self.cache = OutgoingCache(
                 training, OutgoingShape.like(sizes), self.seed, blend=self.cache.blend,
@@ -72,6 +75,9 @@ class NRCIntegrator(CacheIntegrator):
     def default_blend(self, props) -> str:
         blends = self.plan_mode == "everything" and props.get("termination", "spread") != "auto"
         return "reliability" if blends else "ema"
+
+    def default_rate(self, blend: str) -> float:
+        return OutgoingTraining.learning_rate if blend == "ema" else super().default_rate(blend)
 
     @property
     def caches(self) -> tuple[str, ...]:
@@ -174,7 +180,7 @@ NRCIntegrator.__doc__ = (
 
     Training paths begin as those of pixels do, or at places that earlier ones have met; they go on beyond the terminal
     vertex until they have become as wide once more, where the cache completes them (self-training), and each vertex is
-    a record. One in 16 runs on without (``unbounded_share``). The reflectance is factored out of the records and
+    a record. One in 4 runs on without (``unbounded_share``). The reflectance is factored out of the records and
     multiplied back.
 
     .. pluginparameters::
@@ -207,7 +213,7 @@ NRCIntegrator.__doc__ = (
      * - unbounded_share
        - |float|
        - Share of the training paths that run on to their natural end, without self-training: more where light enters
-         by many reflections, and the cache starts too dark. (Default: 0.0625)
+         by many reflections, and the cache starts too dark. (Default: 0.25)
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first

@@ -256,7 +256,7 @@ def test_paths_that_leave_the_scene_are_not_self_trained():
 
 
 def test_records_lie_on_surfaces_and_look_at_the_viewer(cube):
-    training = OutgoingTraining(n_paths=1024)
+    training = OutgoingTraining(n_paths=1024, unbounded_share=1 / 16)
     records, _ = trace_outgoing(cube, cube.sensors()[0], constant_field(1.0), training, mi.UInt32(3), None, False)
     s, valid = records.surface, np.array(records.valid)
     p, n, w = (np.array(v)[:, valid] for v in (s.position, s.normal, s.view))

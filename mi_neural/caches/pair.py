@@ -161,8 +161,9 @@ class PairCache(OutgoingCache):
         value, mean_target, mean_prediction, more = outgoing.learn(
             *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon
         )
+        own_rate = learning_rate * (self.incident_training.learning_rate / self.training.learning_rate)
         value_i, mean_target_i, mean_prediction_i = learn(
-            incident, arrived, self.incident_training, seed + 0x3C6EF372, learning_rate, decay
+            incident, arrived, self.incident_training, seed + 0x3C6EF372, own_rate, decay
         )
         value = dr.select(n_valid > 0, value + value_i, 0)  # nothing to learn is no divergence
         mean_prediction = dr.maximum(mean_prediction, mean_prediction_i)
