@@ -30,7 +30,7 @@ $(TESTS): $(STAMP)
 
 demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EXR, PNG, report in out/demo
 	$(BIN)/mi-neural compare ajar_door -i path -i nirc --seconds 5 --steady 200 --frame-seconds 0.25,1 --denoise \
-	    --reference scenes/ajar_door_320x180.exr -o out/demo
+	    -o out/demo
 	@echo "Open out/demo/report.html"
 
 picture: demo  ## the README's picture, of the demo's frames
@@ -41,18 +41,18 @@ BENCH := -i path -i nirc -i nrc -i nirc:termination=auto -i nirc_two_level --sec
     --repeats 3 --denoise
 
 bench: $(STAMP)  ## integrators on our own scenes: tables and report in out/bench; under 20 minutes on two cores, goes on where stopped
-	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 192x108,144x144 --reference-spp 1024 -o out/bench
+	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 160x90,144x144 -o out/bench
 
 GALLERY := $(BIN)/mi-neural compare
 PATHS := -i path -i nirc -i nrc -i nrc:termination=auto -i nirc_two_level -i nirc_two_level:mode=progressive \
-    -i plain_path:light_sampler.type=nvc_lights --steady 200 --frame-seconds 0.25 --reference-spp 512
+    -i plain_path:light_sampler.type=nvc_lights --steady 200 --frame-seconds 0.25
 DIRECT := -i path -i plain_path:light_sampler.type=power_lights -i plain_path:light_sampler.type=nvc_lights -i restir_di \
     -i nvc_direct -i nvc_direct:mode=neural -D max_depth=2 --steady 200 --frame-seconds 0.25 --reference-spp 512
 LAMP := lamp_panel.to_world=translate(0.7*sin(2*pi*t),-0.4*(1-cos(2*pi*t)),0)@value
 
 gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light: out/gallery/index.html; minutes, goes on where stopped
 	$(GALLERY) cornell_box $(PATHS) --size 144x144 -o out/gallery/1_cornell_box
-	$(GALLERY) ajar_door $(PATHS) --size 256x144 -o out/gallery/2_ajar_door
+	$(GALLERY) ajar_door $(PATHS) --size 320x180 -o out/gallery/2_ajar_door
 	$(GALLERY) glossy_hall $(PATHS) --size 256x144 -o out/gallery/3_glossy_hall
 	$(GALLERY) lamp_bays $(PATHS) --size 256x144 -o out/gallery/4_lamp_bays
 	$(GALLERY) lamp_bays $(DIRECT) --size 256x144 -o out/gallery/5_direct_light

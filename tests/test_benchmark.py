@@ -6,13 +6,14 @@ import json
 import os
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from fake_cache import register
 
-from mi_neural.measure import benchmark, budget, denoise, exr, load, page, reference, repeats, report, suite
+from mi_neural.measure import benchmark, budget, denoise, exr, load, metrics, page, reference, repeats, report, suite
 
 SIZE = (16, 12)
 #: Keys that results must hold, by the contract of the command line.
@@ -300,6 +301,42 @@ def test_reference_beside_a_scene_is_found(tmp_path):
     assert reference.beside(tmp_path / "scene.xml", (8, 4)) == tmp_path / "reference_8x4.exr"
     assert reference.beside(tmp_path / "sun.xml", (8, 4)) == tmp_path / "sun_reference_8x4.exr"
     assert reference.beside(tmp_path / "moon.xml", (8, 4)) is reference.beside(tmp_path / "sun.xml", (4, 8)) is None
+
+
+def test_reference_of_another_scale_is_found_beside_a_scene(tmp_path):
+    for name in ("reference_16x8.exr", "reference_4x2.exr", "reference_32x16.exr", "reference_8x5.exr"):
+        exr.write(tmp_path / name, np.ones((2, 4, 3)))
+    scene = tmp_path / "scene.xml"
+    assert reference.beside(scene, (8, 4)) is None
+    assert reference.beside(scene, (8, 4), scaled=True).name == "reference_16x8.exr"
+    assert reference.beside(scene, (64, 32), scaled=True).name == "reference_32x16.exr"
+    assert reference.beside(scene, (6, 3), scaled=True) is None
+
+
+def test_larger_reference_is_averaged_with_its_noise(tmp_path):
+    values = np.random.default_rng(1).random((4, 6, 3))
+    variance = np.random.default_rng(2).random((4, 6, 3))
+    exr.write(tmp_path / "r.exr", values, exr.layer_channels("variance", variance))
+    found = reference.load_reference(tmp_path / "r.exr", (3, 2), scaled=True)
+    assert found.rgb[1, 2] == pytest.approx(values[2:4, 4:6].mean(axis=(0, 1)), rel=1e-3)
+    assert found.variance[1, 2] == pytest.approx(variance[2:4, 4:6].sum(axis=(0, 1)) / 16, rel=1e-3)
+    assert reference.scale_note(found, (3, 2)) == "Each pixel of the reference is a mean of 2x2 in r.exr."
+    with pytest.raises(load.InputError, match=r"6x4.*3x2.*box filter"):
+        reference.load_reference(tmp_path / "r.exr", (3, 2))
+
+
+def test_errors_against_a_smaller_reference_are_those_of_block_means():
+    rng = np.random.default_rng(3)
+    small = rng.random((4, 6, 3))
+    noise = rng.normal(0.0, 0.3, (8, 12, 3))
+    noise -= np.repeat(np.repeat(metrics.block_means(noise, (4, 6)), 2, axis=0), 2, axis=1)
+    image = np.repeat(np.repeat(small, 2, axis=0), 2, axis=1) + noise  # right on average over every 2x2
+    row = SimpleNamespace()
+    known = reference.Reference(small.astype(np.float32), None, {}, None)
+    flip_map = benchmark.judge(row, [image], known)
+    assert row.relmse < 1e-9 and row.flip < 1e-3 and flip_map.shape == (4, 6)
+    with pytest.raises(ValueError, match="no whole blocks"):
+        benchmark.judge(row, [image[:, :11]], known)
 
 
 def test_references_have_a_place_in_the_users_cache(monkeypatch, tmp_path):

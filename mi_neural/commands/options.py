@@ -24,7 +24,12 @@ Size = Annotated[str | None, typer.Option(metavar="WxH", help="size of the film,
 Seed = Annotated[int, typer.Option(min=0, help="same seed, same image")]
 Variant = Annotated[str, typer.Option(help="Mitsuba variant")]
 ReferenceFile = Annotated[
-    str | None, typer.Option("--reference", metavar="REF.exr", help="measure errors against this image")
+    str | None,
+    typer.Option(
+        "--reference",
+        metavar="REF.exr",
+        help="measure errors against this image, which may be N times as large as the film, or an Nth",
+    ),
 ]
 Denoise = Annotated[bool, typer.Option("--denoise", help="Open Image Denoise with albedo and normals as guides")]
 

@@ -81,8 +81,10 @@ def render(
         case = benchmark.own_case(loaded, keys)
     terminal.require_cache_methods(case, pretrain, save_cache, load_cache)
     output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
-    ref = references.load_reference(reference, loaded.size) if reference else None
+    ref = references.of_film(reference, loaded) if reference else None
     terminal.depth_notes(ref, loaded, [case])
+    if ref is not None and (note := references.scale_note(ref, loaded.size)):
+        terminal.announce(note)
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
     seconds_pretrain, seconds_preview, first_image = 0.0, 0.0, None

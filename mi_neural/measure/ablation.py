@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from . import budget, environment, exr, load, metrics
-from .reference import Reference, load_reference
+from . import reference as references
+from .reference import Reference
+from .repeats import half_width
 
-#: Quantiles of Student's t for two-sided intervals of 95 %, by degrees of freedom.
-T95 = {1: 12.71, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306, 9: 2.262}
 #: What is compared, and in which mode of the plan each is.
 PLANNED, EVERYTHING, EQUAL_TIME = "planned", "everything", "planned, equal time"
 #: Renders references: the scene's own choice of lights is wrong for emitters with attributes of a mesh (README).
@@ -38,9 +38,8 @@ class Estimate:
     @classmethod
     def of(cls, values) -> Estimate:
         values = np.asarray(values, np.float64)
-        n = len(values)
-        half = T95.get(n - 1, 1.96) * values.std(ddof=1) / np.sqrt(n) if n > 1 else float("inf")
-        return cls(float(values.mean()), float(half))
+        half = half_width(values)
+        return cls(float(values.mean()), float("inf") if half is None else half)
 
     def __str__(self):
         return f"{self.mean:.4g} ± {self.half:.2g}"
@@ -94,7 +93,8 @@ def measure(
         return budget.clock() - start, np.asarray(image[..., :3], np.float64)
 
     def judged(images_) -> np.ndarray:
-        found = [metrics.errors(image, reference.rgb, reference.variance, exposures)[0] for image in images_]
+        known = reference.rgb, reference.variance, exposures
+        found = [metrics.errors(metrics.block_means(image, reference.rgb.shape), *known)[0] for image in images_]
         return np.mean([(e.relmse_trimmed, e.flip) for e in found], axis=0)
 
     for r in range(repeats):
@@ -145,9 +145,9 @@ def _begin_anew(integrator, seed: int) -> None:
 
 
 def reference_of(loaded: load.LoadedScene, folder: Path, spp: int, given: str | None, progress=None) -> Reference:
-    """The reference `given`, else one of `spp` samples that is rendered and kept in `folder`."""
-    if given:
-        return load_reference(given, loaded.size)
+    """The reference `given`, or the one beside the scene, or one of `spp` samples, rendered and kept in `folder`."""
+    if given := given or references.beside(loaded.path, loaded.size, loaded.box_filter):
+        return references.of_film(given, loaded)
     width, height = loaded.size
     path = folder / f"reference_{loaded.name}_{width}x{height}_{spp}.exr"
     if not path.is_file():
@@ -163,7 +163,7 @@ def reference_of(loaded: load.LoadedScene, folder: Path, spp: int, given: str | 
         variance = np.var(images, axis=0, ddof=1) / n
         facts = {"integrator": REFERENCE, "spp": str(max(1, spp // n) * n)}
         exr.write(path, np.mean(images, axis=0), exr.layer_channels("variance", variance), facts)
-    return load_reference(path, loaded.size)
+    return references.load_reference(path, loaded.size)
 
 
 def markdown(results: list[Result]) -> str:

@@ -357,11 +357,15 @@ def _name(case: Case, plan: Plan, repeat: int) -> str:
 def judge(
     row: Row, images: list[np.ndarray], reference: Reference | None, exposures: metrics.FlipExposures | None = None
 ) -> np.ndarray | None:
-    """Fill in the row's errors and flicker; returns the FLIP map of the first image, None without a reference."""
+    """Fill in the row's errors and flicker; returns the FLIP map of the first image, None without a reference.
+
+    Images that are larger than the reference are averaged to its size for the errors.
+    """
     if len(images) > 1:
         row.flicker = float(np.mean([metrics.smape(b, a) for a, b in pairwise(images)]))
     if reference is None:
         return None
+    images = [metrics.block_means(image, reference.rgb.shape) for image in images]
     row.relmse, row.relmse_trimmed = _relmse(images, reference)
     found = [metrics.flip(image, reference.rgb, exposures) for image in images]
     row.flip = float(np.mean([f.mean for f in found]))
@@ -371,6 +375,7 @@ def judge(
 def _relmse(images: list[np.ndarray], reference: Reference) -> tuple[float, float]:
     """relMSE and trimmed relMSE, means over the images."""
     known = reference.rgb, reference.variance
+    images = [metrics.block_means(image, reference.rgb.shape) for image in images]
     return (
         float(np.mean([metrics.relmse(image, *known) for image in images])),
         float(np.mean([metrics.relmse_trimmed(image, *known) for image in images])),

@@ -54,6 +54,11 @@ class LoadedScene:
         return tuple(int(n) for n in self.scene.sensors()[0].film().crop_size())
 
     @property
+    def box_filter(self) -> bool:
+        """Whether a pixel is the mean over its square, so that means of pixels are larger pixels."""
+        return self.scene.sensors()[0].film().rfilter().is_box_filter()
+
+    @property
     def default_spp(self) -> int:
         """Samples a pixel that the scene file asks for."""
         return max(1, int(self.scene.sensors()[0].sampler().sample_count()))

@@ -63,6 +63,21 @@ def luminance(image: np.ndarray) -> np.ndarray:
     return np.asarray(image, np.float64) @ np.array(LUMINANCE)
 
 
+def block_means(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The image with the height and width that `shape` begins with: means over blocks of pixels, float64. One of that
+    height and width is returned as it is.
+
+    A block holds a NaN or an infinity if one of its pixels does. Raises ``ValueError`` where blocks would not be whole.
+    """
+    (h, w), (height, width) = image.shape[:2], shape[:2]
+    if (h, w) == (height, width):
+        return image
+    if h % height or w % width:
+        raise ValueError(f"{w}x{h} pixels are no whole blocks for {width}x{height}")
+    blocks = image.reshape(height, h // height, width, w // width, *image.shape[2:])
+    return blocks.mean(axis=(1, 3), dtype=np.float64)
+
+
 def count_nonfinite(image: np.ndarray) -> int:
     """Number of pixels with a NaN or an infinity in any channel."""
     return int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))

@@ -6,9 +6,11 @@ estimated from the spread between passes.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +19,7 @@ import numpy as np
 from . import exr
 from .budget import STREAM_REFERENCE, Progress, clock, pass_seed, pixels, render_pass
 from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, split_channels
-from .metrics import count_nonfinite, relative_squared_errors
+from .metrics import block_means, count_nonfinite, relative_squared_errors
 
 #: Passes hold about this many samples and at most MAX_PASS_SPP a pixel: many passes, or there is no variance to
 #: estimate.
@@ -55,6 +57,16 @@ class Reference:
         noise = self.noise_floor()
         return None if noise is None else noise**0.5
 
+    def averaged(self, size: tuple[int, int]) -> Reference:
+        """This one for a film of `size`, (width, height), k times smaller: means of k x k pixels, whose noise is
+        independent."""
+        scale = self.rgb.shape[1] // size[0]
+        variance = self.variance
+        if variance is not None:
+            variance = (block_means(variance, size[::-1]) / scale**2).astype(np.float32)
+        rgb = block_means(self.rgb, size[::-1]).astype(np.float32)
+        return Reference(rgb, variance, self.metadata | {"averaged": scale}, self.path, self.seconds)
+
     def facts(self) -> dict[str, object]:
         """What results say about it."""
         return {
@@ -64,8 +76,12 @@ class Reference:
         }  # fmt: skip
 
 
-def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Reference:
+def load_reference(path: str | Path, size: tuple[int, int] | None = None, scaled: bool = False) -> Reference:
     """Read a reference and check it against the size (width, height) that will be rendered.
+
+    With `scaled` it may also be k times as large, k a whole number, and is then averaged over k x k pixels; or k times
+    smaller: it stays so, and whoever compares averages the image (:func:`.metrics.block_means`). Right for films with a
+    box filter alone, whose pixels are such means.
 
     Raises :class:`InputError` where the file is missing or no EXR, has another size, or holds NaN or infinities.
     """
@@ -76,25 +92,61 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Ref
         raise InputError(f"no reference {path}: leave --reference out or render one with --reference-spp") from None
     except (ValueError, OSError) as error:
         raise InputError(f"cannot read the reference: {error}") from None
-    if size is not None and image.size != tuple(size):
+    fits = size is None or image.size == tuple(size) or (scaled and scale_between(size, image.size) is not None)
+    if not fits:
         (w, h), (rw, rh) = size, image.size
         raise InputError(
             f"the reference {path} is {rw}x{rh}, the image {w}x{h}: add --size {rw}x{rh} or choose another"
+            + ("" if scaled or scale_between(size, image.size) is None else "; films with a box filter can be scaled")
         )
     if n := count_nonfinite(image.rgb):
         raise InputError(f"the reference {path} has {n} non-finite pixels and cannot be compared with: render it anew")
     variance = image.layer("variance")
     if variance is not None and not (np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise InputError(f"the reference {path} has negative or non-finite values in variance.*: render it anew")
-    return Reference(image.rgb, variance, image.metadata, path)
+    known = Reference(image.rgb, variance, image.metadata, path)
+    return known.averaged(size) if size is not None and image.size[0] > size[0] else known
 
 
-def beside(path: Path, size: tuple[int, int]) -> Path | None:
+def scale_between(size: tuple[int, int], other: tuple[int, int]) -> int | None:
+    """How many times one of two sizes is the other, in both directions; None if that is no whole number."""
+    (w, h), (ow, oh) = sorted((tuple(size), tuple(other)))
+    return ow // w if ow % w == 0 and oh == h * (ow // w) else None
+
+
+def beside(path: Path, size: tuple[int, int], scaled: bool = False) -> Path | None:
     """A reference of this size in the scene file's own folder: `reference_640x360.exr` for `scene.xml`, else
-    `NAME_reference_640x360.exr`; None where there is none."""
-    name = f"reference_{size[0]}x{size[1]}.exr"
-    file = path.parent / (name if path.stem == "scene" else f"{path.stem}_{name}")
-    return file if file.is_file() else None
+    `NAME_reference_640x360.exr`; None where there is none.
+
+    With `scaled`, where no file has just this size, the next larger one that can be averaged to it, or else the next
+    smaller one, see :func:`load_reference`.
+    """
+    start = "reference_" if path.stem == "scene" else f"{path.stem}_reference_"
+    file = path.parent / f"{start}{size[0]}x{size[1]}.exr"
+    if file.is_file():
+        return file
+    found = []
+    for other in path.parent.glob(glob.escape(start) + "*x*.exr") if scaled else ():
+        numbers = re.fullmatch(r"(\d+)x(\d+)", other.stem[len(start) :])
+        if numbers and (scale := scale_between(size, (w := int(numbers[1]), int(numbers[2])))):
+            found.append((w < size[0], scale, other))
+    return min(found)[-1] if found else None
+
+
+def of_film(path: str | Path, loaded: LoadedScene) -> Reference:
+    """:func:`load_reference` for what `loaded` will render, scaled where its film allows it."""
+    return load_reference(path, loaded.size, loaded.box_filter)
+
+
+def scale_note(reference: Reference, size: tuple[int, int]) -> str | None:
+    """One line where this reference and images of `size` were not of one size, else None."""
+    height, width = reference.rgb.shape[:2]
+    if averaged := reference.metadata.get("averaged"):
+        return f"Each pixel of the reference is a mean of {averaged}x{averaged} in {reference.path.name}."
+    if (width, height) == tuple(size):
+        return None
+    n = size[0] // width
+    return f"The reference is {width}x{height}: errors are those of means of {n}x{n} pixels; flicker is of single ones."
 
 
 def cache_folder() -> Path:

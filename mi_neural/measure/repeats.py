@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .benchmark import Row
-from .metrics import bias_and_variance, relative_squared_errors
+from .metrics import bias_and_variance, block_means, relative_squared_errors
 from .reference import Reference
 
 LEVEL = 0.95
@@ -92,7 +92,8 @@ def group(rows: Iterable[Row]) -> list[Group]:
 
 def tell_apart(found: Group, image: Callable[[Row], np.ndarray | None], reference: Reference) -> None:
     """Fill in bias and variance of a group by the images of its rows, one of each repeat."""
-    images = [rgb for row in found.rows if (rgb := image(row)) is not None]
+    images = [image(row) for row in found.rows]
+    images = [block_means(rgb, reference.rgb.shape) for rgb in images if rgb is not None]
     n = len(images)
     if n < 2:
         return

@@ -171,7 +171,8 @@ class Suite:
         labels = ", ".join(spec.label for spec in settings.specs)
         terminal.announce(f"{name} {loaded.size[0]}x{loaded.size[1]}, {labels}")
         reference = self._reference(loaded)
-        notes = terminal.depth_notes(reference, loaded, cases) + terminal.notes(reference, settings.denoise)
+        notes = terminal.depth_notes(reference, loaded, cases)
+        notes += terminal.notes(reference, settings.denoise, loaded.size)
         found = report.SceneResult(name, loaded.size, [], [], reference.facts(), notes)
         self.results.append(found)
 
@@ -239,9 +240,10 @@ class Suite:
         """The image that was named, or the one beside the scene, or one that is rendered or was before."""
         settings = self.settings
         if settings.reference is not None:
-            return references.load_reference(settings.reference, loaded.size)
-        if settings.reference_spp is None and (file := references.beside(loaded.path, loaded.size)):
-            return references.load_reference(file, loaded.size)
+            return references.of_film(settings.reference, loaded)
+        found = references.beside(loaded.path, loaded.size, loaded.box_filter)
+        if settings.reference_spp is None and found:
+            return references.of_film(found, loaded)
         n = settings.reference_spp or DEFAULT_REFERENCE_SPP
         folder = settings.reference_cache or references.cache_folder()
         folder.mkdir(parents=True, exist_ok=True)

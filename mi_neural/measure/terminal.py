@@ -239,8 +239,9 @@ def slug(row: benchmark.Row) -> str:
     return "_".join(part for part in parts if part)
 
 
-def notes(reference: references.Reference, denoised: bool) -> list[str]:
-    notes = []
+def notes(reference: references.Reference, denoised: bool, size: tuple[int, int]) -> list[str]:
+    scaled = references.scale_note(reference, size)
+    notes = [scaled] if scaled else []
     spp = reference.metadata.get("spp", "unknown")
     if reference.variance is None:
         notes.append(f"Reference: {spp} spp; it carries no variance, so its own noise is part of every error.")
