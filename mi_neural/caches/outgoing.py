@@ -32,7 +32,7 @@ ALBEDO_MIN = 0.05
 TARGET_MAX = 1e4
 #: Of the relative loss, over the squared scale (Müller et al. 2021).
 EPSILON = 1e-2
-#: The learning rate of this network over that of the incident cache, trained on the same paths. Measured: README
+#: The learning rate of this network over that of the incident cache, trained on the same paths (manual, 6_measured)
 RATE = 3.0
 #: Bins of the roughness, encoded as 1 - e^-roughness.
 ROUGHNESS_BINS = 4
