@@ -38,7 +38,7 @@ class Training:
 
     n_paths          training paths
     n_vertices       vertices of a path; it ends in the cache itself (self-training). Long suffixes carry light through
-                     a closed room in a few frames and do not build on the cache's own errors; measured: manual, 6_measured
+                     a closed room in a few frames and do not build on the cache's own errors (manual, 6_measured)
     n_tail           cache queries at the end of a path
     n_local          queries that estimate the local mean of `loss.local_relative_l2`
     epsilon          of that loss, over the squared mean target of the scene
