@@ -438,7 +438,7 @@ def test_frozen_functions_are_not_recorded_again(sphere):
 def test_statistics_count_records_queries_and_losses(sphere):
     integrator = nrc()
     s = integrator.train(sphere, 5)
-    assert s["steps"] == 5 and 5 * 512 < s["records"] < 5 * 512 * 3 and s["nonfinite"] == 0
+    assert s["steps"] == 5 and 5 * 512 < s["records"] <= 5 * 512 * 3 and s["nonfinite"] == 0
     assert len(integrator.cache.history) == 5 and integrator.cache.history[-1] == pytest.approx(s["loss"])
     render(sphere, integrator, 4)
     assert integrator.statistics()["queries"] == 4 * 16 * 16

@@ -122,7 +122,7 @@ def sequence(
             notes.append(f"Not all frames are there: {problem}. The same command goes on from here.")
         if run.references is not None and run.references.exposures is not None:
             first, exposures = run.references.of(0), run.references.exposures
-            notes += terminal.depth_notes(first, loaded, cases) + terminal.notes(first, False)
+            notes += terminal.depth_notes(first, loaded, cases) + terminal.notes(first, False, loaded.size)
             notes.append(
                 f"FLIP: exposures {exposures.start:.2f} to {exposures.stop:.2f} stops in {exposures.num} steps for all "
                 "frames, from the lowest to the highest that any of the references asks for."
