@@ -343,7 +343,7 @@ def test_mirror_lobes_are_not_left_to_the_incident_cache():
 
 
 def test_mix_has_less_error_than_either_part():
-    """The cache at the first vertex alone, tracing alone, and the mix, at 64 samples a pixel: 0.0023, 0.0024, 0.0020."""
+    """The cache at the first vertex alone, tracing alone, and the mix, at 64 samples: 0.0023, 0.0024, 0.0020."""
     box = mi.load_file(str(scenes.path("cornell_box")), resx=48, resy=48)
     trained = auto(train_samples=1024)
     trained.train(box, 200)
