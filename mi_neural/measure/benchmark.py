@@ -292,7 +292,7 @@ class Bench:
             row.peak_mib = memory.peak_mib() if self.counts_memory else None
             flip_map = None
             if mode == "curve":
-                row.relmse, row.relmse_trimmed = _relmse(images, self.reference)
+                row.relmse, row.relmse_trimmed = _relmse(_averaged(images, self.reference), self.reference)
             elif mode != "split":
                 flip_map = judge(row, images, self.reference, self.exposures)
             shown = (None, None, None) if mode in WITHOUT_PICTURE else (frames[0], images[0], flip_map)
@@ -365,17 +365,21 @@ def judge(
         row.flicker = float(np.mean([metrics.smape(b, a) for a, b in pairwise(images)]))
     if reference is None:
         return None
-    images = [metrics.block_means(image, reference.rgb.shape) for image in images]
+    images = _averaged(images, reference)
     row.relmse, row.relmse_trimmed = _relmse(images, reference)
     found = [metrics.flip(image, reference.rgb, exposures) for image in images]
     row.flip = float(np.mean([f.mean for f in found]))
     return found[0].map
 
 
+def _averaged(images: list[np.ndarray], reference: Reference) -> list[np.ndarray]:
+    """The images at the reference's size, see :func:`.reference.load_reference`."""
+    return [metrics.block_means(image, reference.rgb.shape) for image in images]
+
+
 def _relmse(images: list[np.ndarray], reference: Reference) -> tuple[float, float]:
-    """relMSE and trimmed relMSE, means over the images."""
+    """relMSE and trimmed relMSE, means over the images, which have the reference's size."""
     known = reference.rgb, reference.variance
-    images = [metrics.block_means(image, reference.rgb.shape) for image in images]
     return (
         float(np.mean([metrics.relmse(image, *known) for image in images])),
         float(np.mean([metrics.relmse_trimmed(image, *known) for image in images])),
