@@ -11,6 +11,7 @@ import mitsuba as mi
 from mi_neural.caches.blend import sigma_channels, where_active
 from mi_neural.caches.incident import reflect
 from mi_neural.integrators import prefix
+from mi_neural.transport import vertex
 from mi_neural.transport.suffixes import surface_of
 
 #: Queries a camera sample, at its first vertex and at its end; fewer where only one of them is asked, more where the
@@ -51,8 +52,7 @@ def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
     cached = integrator.needs_cache and field is not None
 
     def stop(si, spread, smooth, first, sampler):
-        n = mi.Vector3f(si.sh_frame.n)
-        share, incident = field.accuracy.choose(si.p, n, n_samples, smooth)
+        share, incident = field.accuracy.choose(si.p, vertex.facing(si), n_samples, smooth)
         incident &= ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)  # whose reflections the cache is not asked for
         wide = smooth & ~first & spread.exceeds(integrator.spread_threshold)
         ends = wide & (sampler.next_1d() < field.accuracy.stops(si.p, n_samples, wide))
@@ -75,8 +75,9 @@ def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
     at_end = mi.Color3f(*where_active(path.ends, at_end.inputs(), outgoing, 3))
 
     lit = path.ends_lit
+    point = mi.Point3f(path.si.p), vertex.facing(path.si)
     features = where_active(
-        lit, (mi.Point3f(path.si.p),), lambda x: tuple(field.incident.encode(x)), field.incident.shape.n_encoded
+        lit, point, lambda x, n: tuple(field.incident.encode(x, n)), field.incident.shape.n_encoded
     )
     by_incident = reflect(
         field.incident, list(features), path.si, path.si.bsdf(path.ray), integrator.cache.n_queries, sampler, lit

@@ -184,7 +184,7 @@ class NIRCIntegrator(CacheIntegrator):
         bsdf = si.bsdf(ray)
         n_light = self.n_light
         cached = self.needs_cache and field is not None
-        features = field.encode(si.p, si.sh_frame.n) if cached else None
+        features = field.encode(si.p, vertex.facing(si)) if cached else None
         a_0 = termination.camera_spread(dr.squared_norm(si.p - ray.o), dr.dot(si.n, ray.d))
 
         # Of the traced samples, so many gather what lies far: as few as the share allows, to save the rest their rays
@@ -258,7 +258,7 @@ class NIRCIntegrator(CacheIntegrator):
         L += dr.select(active, β * (direct + cache + residual), 0)
         channels = {"direct": β * direct, "cache": β * cache, "residual": β * residual}
         channels |= {"depth": depth + mi.Float(n_rays) / n_light, "share": mi.Float(0)}
-        channels |= sigma_channels(field if cached else None, si.p, si.sh_frame.n)
+        channels |= sigma_channels(field if cached else None, si.p, vertex.facing(si))
         return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
 
     def gather_share(self, delta, pdf, spread, a_0, far):
@@ -298,7 +298,7 @@ class NIRCIntegrator(CacheIntegrator):
             β_next = vertex.finite(β * weight, active)
             stop = wide & ~delta & (bs.pdf <= SHARP_PDF)
             if cached:
-                L += dr.select(stop, β_next * field.query(field.encode(si.p, si.sh_frame.n), wo), 0)
+                L += dr.select(stop, β_next * field.query(field.encode(si.p, vertex.facing(si)), wo), 0)
             η *= bs.eta
             depth += 1
             followed = active & ~stop & (dr.max(β_next) > 0)

@@ -197,7 +197,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
             asked = active & vertex.has_smooth(bsdf) & ~cancels
             α = self.coefficient(field, si, alpha, asked)
             asked &= (α > 0) | (mi.Bool(self.ris) & (n_cache > 1))
-            features = field.encode(si.p, si.sh_frame.n, asked)
+            features = field.encode(si.p, vertex.facing(si), asked)
         else:
             asked = mi.Bool(False)
 
@@ -285,8 +285,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
     def coefficient(self, field, si, alpha, active):
         """α at a vertex: `alpha` itself, or by place where it is negative; 0 where not `active`."""
         by_place = active & (alpha < 0)
-        n = dr.mulsign(mi.Vector3f(si.sh_frame.n), si.wi.z)
-        return dr.select(active, dr.select(by_place, field.alpha_at(si.p, n, by_place), alpha), 0)
+        return dr.select(active, dr.select(by_place, field.alpha_at(si.p, vertex.facing(si), by_place), alpha), 0)
 
     def resampled(self, candidate, field, n, sampler, active):
         """One of `n` directions, kept in proportion to what the cache says comes from there: (sum of what it says,
@@ -347,7 +346,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
                 asked = active & vertex.has_smooth(bsdf)
                 α = self.coefficient(field, si, alpha, asked)
                 asked &= α > 0
-                features = field.encode(si.p, si.sh_frame.n, asked)
+                features = field.encode(si.p, vertex.facing(si), asked)
                 said = asked & ~delta & (bs.pdf <= SHARP_PDF)
                 followed = vertex.finite(weight * field.query(features, wo, said), said)
                 bs_2, weight_2 = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), asked)

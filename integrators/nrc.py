@@ -15,6 +15,7 @@ from mi_neural.integrators import automatic, prefix
 from mi_neural.integrators.automatic import AUTO
 from mi_neural.integrators.common import CacheIntegrator
 from mi_neural.integrators.keys import SHARED_KEYS
+from mi_neural.transport import vertex
 from mi_neural.transport.suffixes import surface_of
 
 #: Where paths end
@@ -118,7 +119,7 @@ class NRCIntegrator(CacheIntegrator):
             surface = surface_of(path.si, path.si.bsdf(path.ray), asks, path.glossy)
             cache = dr.select(asks, path.β * field.query(*surface.inputs()), 0)
         channels = {"traced": path.L, "cached": cache, "depth": dr.select(path.visible, mi.Float(path.depth), 0)}
-        shown = sigma_channels(field if cached else None, path.si.p, path.si.sh_frame.n)
+        shown = sigma_channels(field if cached else None, path.si.p, vertex.facing(path.si))
         channels |= {k: dr.select(path.ends | path.ends_lit, v, 0) for k, v in shown.items()}
         channels |= {"share": mi.Float(0), "cache": mi.Color3f(0), "density": mi.Float(0)}
         if views:

@@ -458,7 +458,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 
     def alike(self, a, distance_a, b, distance_b):
         """Whether two surfaces may share light samples: their normals and distances from the camera are close."""
-        facing = dr.dot(_facing(a), _facing(b)) >= self.normal_threshold
+        facing = dr.dot(vertex.facing(a), vertex.facing(b)) >= self.normal_threshold
         return facing & (dr.abs(distance_a - distance_b) <= self.depth_threshold * distance_a)
 
     def reuse_frame(self, scene, power, past_power, si, kept, past, before, found, sampler) -> Reservoir:
@@ -525,11 +525,6 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 def _visible(scene, si, p_light, active):
     """Whether nothing stands between a surface and a point on a light; false where not `active`."""
     return active & ~scene.ray_test(si.spawn_ray_to(p_light), active)
-
-
-def _facing(si):
-    """Shading normal on the side that the surface is seen from."""
-    return dr.mulsign(mi.Vector3f(si.sh_frame.n), si.wi.z)
 
 
 def _slim(si):

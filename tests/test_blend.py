@@ -43,8 +43,9 @@ def answers(asked, points) -> np.ndarray:
 def both(blend, points):
     blend.field.sync()
     x, w = points
-    averaged = np.array(blend.field.query(blend.field.encode(x), w))
-    current = np.array(blend.field.query(blend.field.encode(x, averaged=False), w, averaged=False))
+    field, n = blend.field, mi.Normal3f(0, 0, 1)
+    averaged = np.array(field.query(field.encode(x, n), w))
+    current = np.array(field.query(field.encode(x, n, averaged=False), w, averaged=False))
     assert np.abs(averaged - current).mean() > 0.1
     return averaged, current
 

@@ -44,7 +44,7 @@ class Incident:
     def answers(self) -> np.ndarray:
         records, _ = trace_records(*self.place, None, self.cache.training, mi.UInt32(77))
         field = self.cache.field
-        found = np.array(field.query(field.encode(records.position), records.direction))
+        found = np.array(field.query(field.encode(records.position, records.normal), records.direction))
         return found[:, np.array(records.valid)]
 
 

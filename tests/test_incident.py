@@ -61,7 +61,7 @@ def by_vertex(records, training) -> np.ndarray:
 def answers(cache: IncidentCache, scene, sensor) -> np.ndarray:
     """What the cache says at fresh records, where it will be asked."""
     records, _ = trace_records(scene, sensor, None, cache.training, mi.UInt32(77))
-    found = np.array(cache.field.query(cache.field.encode(records.position), records.direction))
+    found = np.array(cache.field.query(cache.field.encode(records.position, records.normal), records.direction))
     return found[:, np.array(records.valid)]
 
 

@@ -22,7 +22,7 @@ class ArrayField(TrainedField):
     1-wide. Subclasses name their arrays in `ARRAYS` and give
 
     zeros()            the arrays as they are before training: name -> array
-    encode(x, n)       what depends on the position alone: a list of arrays. `n`: unit normal on the lit side, or None
+    encode(x, n)       what depends on the point alone: a list of arrays. `n`: unit normal on the seen side, or None
     query(features, w) radiance (Color3f) from direction `w` at the encoded position, finite and never negative
     """
 
@@ -51,7 +51,7 @@ class ArrayField(TrainedField):
         raise NotImplementedError(f"{type(self).__name__} must define zeros()")
 
     def encode(self, x, n=None) -> list:
-        """What depends on the position alone, as a list of arrays."""
+        """What depends on the point alone, as a list of arrays."""
         raise NotImplementedError(f"{type(self).__name__} must define encode()")
 
     def query(self, features: list, w):

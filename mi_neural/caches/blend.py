@@ -68,12 +68,13 @@ class Blend:
         return dr.select(sigma < NEGLIGIBLE, 0, dr.select(sigma > 1 - NEGLIGIBLE, 1, sigma))
 
     def encode(self, x, n) -> tuple:
-        """What depends on the position alone, of either predictor where it counts."""
+        """What depends on the point alone, of either predictor where it counts."""
         if self.grid is None:
-            return None, None, self.field.features(self.fast, x)
+            return None, None, self.field.features(self.fast, self.field.lift(x, n))
         sigma, n_values = self.sigma(x, n), self.field.shape.n_encoded
+        x = mi.Point3f(self.field.lift(x, n))
         return sigma, *(
-            where_active(asks, (mi.Point3f(x),), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
+            where_active(asks, (x,), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
             for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))
         )
 

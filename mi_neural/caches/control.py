@@ -64,10 +64,10 @@ class ControlVariate:
     # -----------------------------------------------------------------------------------------------------------------
 
     def encode(self, x, n=None, active=True) -> list:
-        """What depends on the position alone; where not `active` nothing, at no cost if that holds for a packet."""
+        """What depends on the point alone; where not `active` nothing, at no cost if that holds for a packet."""
         if active is True:
-            return self.field.encode(x)
-        return list(where_active(active, (mi.Point3f(x),), lambda x: tuple(self.field.encode(x)),
+            return self.field.encode(x, n)
+        return list(where_active(active, (mi.Point3f(x), mi.Vector3f(n)), lambda x, n: tuple(self.field.encode(x, n)),
                                  self.field.shape.n_encoded))  # fmt: skip
 
     def query(self, features: list, w, active=True):
@@ -117,7 +117,7 @@ class ControlCache(IncidentCache):
     def _look_plain(self, scene, sensor, lights, cache, seed):
         records, _ = trace_records(scene, sensor, cache, self.training, seed, lights)
         dr.eval(records)
-        answers = cache.query(cache.encode(records.position), records.direction)
+        answers = cache.query(cache.encode(records.position, records.normal), records.direction)
         cache.observe(records, records.target, answers, answers)
         return cache.mean_sigma()
 

@@ -19,6 +19,9 @@ __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedFiel
 #: Largest sizes of a field: beyond, a slip of the pen or a damaged file fills the memory.
 LARGEST = {"n_levels": 32, "n_features": 16, "hashmap_size": 2**24, "base_resolution": 2**12, "width": 1024,
            "n_hidden": 32, "n_outputs": 1024}  # fmt: skip
+#: Points are looked up so many cells of the finest level above their surface: both sides of a thin wall are one point,
+#: and lifted they are apart (manual, 6_measured).
+LIFT = 2.0
 
 
 @dataclass(frozen=True)
@@ -285,6 +288,15 @@ class TrainedField:
         self.current.order = self.averaged.order
         return self.current
 
+    def lift(self, x, n):
+        """Where the grid is looked up for a point `x` of a surface: `LIFT` cells towards the unit normal `n`. Without a
+        normal, `x` itself."""
+        if n is None:
+            return x
+        shape = self.shape
+        share = LIFT / (shape.base_resolution * shape.per_level_scale ** (shape.n_levels - 1))
+        return x + mi.Vector3f(n) * (share * dr.rcp(self.box_inv_extent))
+
     def optimizers(self) -> list:
         """The optimisers that hold the weights being trained."""
         return [self.optimizer]
@@ -448,9 +460,9 @@ class Field(TrainedField):
     # Query
 
     def encode(self, x, n=None, averaged: bool = True) -> list:
-        """What depends on the position alone: once per point, however many directions follow. The normal `n` is not
-        asked for here; a :class:`~mi_neural.caches.blend.Blend` may."""
-        return self.features(self.averaged if averaged else self.current, x)
+        """What depends on the point alone: once per point, however many directions follow. `n`: its unit normal on the
+        side that it is seen from, see :meth:`lift`; the same at training and at queries."""
+        return self.features(self.averaged if averaged else self.current, self.lift(x, n))
 
     def raw(self, features: list, w, averaged: bool = True):
         """The network's output over `scale`, not clamped."""
@@ -479,13 +491,14 @@ class Field(TrainedField):
     # -------------------------------------------------------------------------------------------------------------
     # Training
 
-    def predict(self, x, w):
-        """What :meth:`raw` gives for the weights being trained, differentiable with respect to them.
+    def predict(self, x, w, n=None):
+        """What :meth:`raw` gives at points with normals `n` for the weights being trained, differentiable with respect
+        to them.
 
         Call it once per :meth:`step`, before it.
         """
         weights = self.trainable()
-        inputs = [*self._grid_values(weights, x), *encoding.direction(w, self.shape.direction_degree)]
+        inputs = [*self._grid_values(weights, self.lift(x, n)), *encoding.direction(w, self.shape.direction_degree)]
         return mi.Color3f(*weights.differentiable(inputs)) + 1
 
     def step(self, losses, learning_rate, decay):

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport import vertex
 from ..transport.freezing import can_freeze, undisturbed
 from ..transport.records import TrainingRecords, trace_training_paths
 from ..transport.samples import PathSampler
@@ -83,7 +84,7 @@ def trace_records(scene, sensor, field: Field | Blend | None, training: Training
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
     def from_cache(si, bsdf, active, sampler):
-        return reflect(field, field.encode(si.p, si.sh_frame.n), si, bsdf, training.n_tail, sampler, active)
+        return reflect(field, field.encode(si.p, vertex.facing(si)), si, bsdf, training.n_tail, sampler, active)
 
     tail = from_cache if field is not None else (lambda si, bsdf, active, sampler: mi.Color3f(0))
     return trace_training_paths(scene, sensor, sampler, training.n_paths, training.n_vertices, tail, lights)
@@ -113,7 +114,8 @@ def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
 def local_mean(field: Field, features: list, records: TrainingRecords, n: int, sampler):
     """Mean prediction, by the weights being trained, over the cosine-weighted hemisphere at each record, over `scale`,
     from `n` queries."""
-    frame = mi.Frame3f(mi.Normal3f(records.normal))
+    normal = dr.mulsign(records.normal, dr.dot(records.normal, records.direction))
+    frame = mi.Frame3f(mi.Normal3f(normal))
 
     def add(i, total, sampler):
         w = frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
@@ -136,13 +138,13 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
         mean_target = dr.sum(loss.luminance(y)) / n_valid
         field.mean = dr.lerp(mean_target, field.mean, decay)
         dr.eval(y, field.mean)
-        averaged = field.query(field.encode(records.position), records.direction) if blend else None
+        averaged = field.query(field.encode(records.position, records.normal), records.direction) if blend else None
         dr.schedule(averaged)
 
-    p = field.predict(records.position, records.direction)
+    p = field.predict(records.position, records.direction, records.normal)
     with dr.suspend_grad():
         sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
-        features = field.encode(records.position, averaged=False)  # the same look-ups as the prediction's
+        features = field.encode(records.position, records.normal, averaged=False)  # looked up as the prediction's
         mean_local = local_mean(field, features, records, training.n_local, sampler)
     said = dr.detach(p)
     dr.schedule(said)

@@ -194,7 +194,7 @@ class OutgoingField(TrainedField):
             "albedo": lambda: dr.clip(albedo, 0, 1),
             "roughness": lambda: encoding.one_blob(1 - dr.exp(-dr.maximum(roughness, 0)), ROUGHNESS_BINS),
         }
-        values = list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        values = list(weights.grid(encoding.to_unit_cube(self.lift(x, n), self.box_min, self.box_inv_extent)))
         for name in INPUTS:
             if name in self.shape.inputs:
                 values += list(encoded[name]())

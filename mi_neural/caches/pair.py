@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport import vertex
 from ..transport.suffixes import scene_is_glossy
 from .accuracy import Accuracy, Pairs
 from .field import Field, FieldShape, TrainedField
@@ -142,7 +143,7 @@ class PairCache(OutgoingCache):
         outgoing, incident = field.outgoing, field.incident
 
         def ask(si, bsdf, active, sampler):
-            features = incident.encode(si.p)
+            features = incident.encode(si.p, vertex.facing(si))
             return reflect(incident, features, si, bsdf, self.n_queries, sampler, active)
 
         with dr.suspend_grad():

@@ -106,9 +106,9 @@ class HarmonicField(Field):
             for i in range(3)
         ))  # fmt: skip
 
-    def predict(self, x, w):
+    def predict(self, x, w, n=None):
         weights = self.trainable()
-        return self.output(weights, self.features(weights, x), w)
+        return self.output(weights, self.features(weights, self.lift(x, n)), w)
 
     @classmethod
     def make(cls, constants: dict) -> HarmonicField:

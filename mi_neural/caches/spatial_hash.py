@@ -215,7 +215,7 @@ class SpatialHashCache(IncidentCache):
         with dr.suspend_grad():
             n_valid = dr.maximum(dr.count(records.valid), 1)
             y = dr.select(records.valid, dr.clip(records.target / asked.scale, 0, TARGET_MAX), 0)
-            p = asked.raw(asked.encode(records.position), records.direction)
+            p = asked.raw(asked.encode(records.position, records.normal), records.direction)
             error = dr.select(records.valid, loss.relative_l2(p, y, self.training.epsilon), 0)
             level, said = (dr.select(records.valid, loss.luminance(v), 0) for v in (y, p))
             dr.eval(y, error, level, said)

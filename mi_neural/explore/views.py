@@ -46,7 +46,7 @@ class Hemisphere:
         si = _seen(scene, camera, dr.opaque(mi.Float, pixel[0] + 0.5), dr.opaque(mi.Float, pixel[1] + 0.5))
         if not bool(si.is_valid()[0]):
             raise Unavailable(f"nothing is seen in pixel {pixel}; choose one that shows a surface")
-        normal = dr.mulsign(mi.Normal3f(si.sh_frame.n), si.wi.z)
+        normal = mi.Normal3f(vertex.facing(si))
         self.position, self.normal = (_numbers(v) for v in (si.p, normal))
         self.restart()
 
@@ -128,7 +128,7 @@ class ReliabilityMap:
             raise Unavailable("this integrator asks the averaged weights everywhere; give it blend='reliability'")
         with dr.suspend_grad():
             si, shape = _first_surfaces(self.scene, self.sensor)
-            sigma = blend.sigma(si.p, mi.Normal3f(si.sh_frame.n))
+            sigma = blend.sigma(si.p, vertex.facing(si))
             return np.array(dr.select(si.is_valid(), sigma, 0)).reshape(shape)
 
 
@@ -159,7 +159,7 @@ class VisibilityMap:
         lights, group = _lights(self.integrator), dr.opaque(mi.UInt32, self.group)
         with dr.suspend_grad():
             si, shape = _first_surfaces(self.scene, self.sensor)
-            p = si.spawn_ray(dr.mulsign(mi.Vector3f(si.sh_frame.n), si.wi.z)).o
+            p = si.spawn_ray(vertex.facing(si)).o
             lane, visible = dr.arange(mi.UInt32, dr.width(p)), mi.Float(0)
             for k in range(spp):
                 sampler = PathSampler.make(lane, dr.opaque(mi.UInt32, self.spp + k))

@@ -20,7 +20,7 @@ class TrainingRecords:
 
     position   points on surfaces, world space
     direction  unit vectors, away from the surface
-    normal     unit shading normals, on the side of `direction`
+    normal     unit shading normals, on the side that the path came from
     target     estimates of the radiance that arrives at `position` from `direction` after at least one reflection
     valid      mask
     """
@@ -90,8 +90,7 @@ def trace_training_paths(
         dr.scatter(f, dr.select(alive, weight, 0), i)
         dr.scatter(records.position, si.p, i)
         dr.scatter(records.direction, wo, i)
-        n = mi.Vector3f(si.sh_frame.n)
-        dr.scatter(records.normal, dr.mulsign(n, dr.dot(n, wo)), i)
+        dr.scatter(records.normal, vertex.facing(si), i)
         dr.scatter(records.valid, alive & smooth & ~delta, i)
         return k + 1, ray, si_next, alive & si_next.is_valid(), sampler
 

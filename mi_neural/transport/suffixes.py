@@ -68,9 +68,8 @@ def surface_of(si, bsdf, active, glossy: bool = True) -> Surface:
             width = dr.minimum(dr.rsqrt(dr.pi * dr.maximum(bs.pdf, 1e-6)), 1)
             roughness += dr.select(delta, 0, share * width)
             total += share
-    n = mi.Vector3f(si.sh_frame.n)
     return Surface(
-        mi.Point3f(si.p), dr.mulsign(n, si.wi.z), si.to_world(si.wi), dr.minimum(albedo, 1),
+        mi.Point3f(si.p), vertex.facing(si), si.to_world(si.wi), dr.minimum(albedo, 1),
         roughness / total if glossy else mi.Float(0),
     )  # fmt: skip
 
@@ -326,9 +325,8 @@ def trace_suffixes(
     records.valid &= finite
     records.target = dr.select(records.valid, records.target, 0)
     finite = dr.all(dr.isfinite(arrived))
-    normal = dr.mulsign(records.surface.normal, dr.dot(records.surface.normal, direction))
     arrived = dr.select(finite, arrived, 0)
-    incident = TrainingRecords(records.surface.position, direction, normal, arrived, rough & finite)
+    incident = TrainingRecords(records.surface.position, direction, records.surface.normal, arrived, rough & finite)
     return records, n_bad, Bounces(N + f * E, f, incident, stops), said
 
 

@@ -106,7 +106,11 @@ def emitted(
     return L, dr.select(emits, si_next.emitter(scene, emits).eval(si_next, emits) * w_mis, 0)
 
 
+def facing(si):
+    """Unit shading normal on the side that the path came from."""
+    return dr.mulsign(mi.Vector3f(si.sh_frame.n), si.wi.z)
+
+
 def receiver(si, bsdf):
     """How a surface receives light, for choosing one: its normal on the side that is seen, and whether it transmits."""
-    n = mi.Vector3f(si.sh_frame.n)
-    return dr.mulsign(n, si.wi.z), mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+    return facing(si), mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
