@@ -400,3 +400,21 @@ def test_rollback_undoes_training(cube):
     first = Field(*cache.field.box, cache.shape, scale=cache.field.scale[0], seed=cache.seed).snapshot()
     cache.rollback(None)
     assert same(first, cache.field.snapshot()) and cache.steps == cache.field.steps == 0
+
+
+@pytest.mark.parametrize("type_", ["nirc", "nrc"])
+def test_normals_that_are_not_finite_spoil_no_training(type_):
+    """A lit cube with a triangle in it, one of whose vertices has no normal: records there are left out."""
+    cube = mi.load_string(scenes.path("lit_cube").read_text(), resx=16, resy=16)
+    broken = mi.Mesh("broken", 3, 1, has_vertex_normals=True, props=mi.Properties())
+    params = mi.traverse(broken)
+    params["vertex_positions"] = [-0.5, -0.5, 0, 0.5, -0.5, 0, 0, 0.5, 0]
+    params["vertex_normals"] = [0, 0, 1, 0, 0, 1, math.nan, math.nan, math.nan]
+    params["faces"] = [0, 1, 2]
+    params.update()
+    scene = mi.load_dict({"type": "scene", "broken": broken, "sensor": cube.sensors()[0],
+                          **{f"s{k}": s for k, s in enumerate(cube.shapes())}})  # fmt: skip
+    integrator = mi.load_dict({"type": type_, "train_samples": 512, "train_frames": 16})
+    image = np.array(mi.render(scene, integrator=integrator, spp=4))
+    found = integrator.statistics()
+    assert np.isfinite(image).all() and found["recoveries"] == 0 and math.isfinite(found["loss"])

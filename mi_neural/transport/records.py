@@ -40,6 +40,23 @@ def empty_records(n: int) -> TrainingRecords:
     )  # fmt: skip
 
 
+def leave_out_nonfinite(records: TrainingRecords) -> mi.UInt32:
+    """Make records invalid, and harmless, of which anything is not finite; returns how many.
+
+    Positions, directions and normals are so where those of a mesh are.
+    """
+    finite = mi.Bool(True)
+    for v in (records.position, records.direction, records.normal, records.target):
+        finite &= dr.all(dr.isfinite(v))
+    n_bad = dr.count(records.valid & ~finite)
+    records.valid &= finite
+    up = mi.Vector3f(0, 0, 1)
+    records.position = dr.select(finite, records.position, 0)
+    records.direction, records.normal = (dr.select(finite, v, up) for v in (records.direction, records.normal))
+    records.target = dr.select(records.valid, records.target, 0)
+    return n_bad
+
+
 def trace_training_paths(
     scene, sensor, sampler, n_paths: int, n_vertices: int, tail: Callable, lights=None
 ) -> tuple[TrainingRecords, mi.UInt32]:
@@ -54,7 +71,7 @@ def trace_training_paths(
     record's own direction is not part of it: it belongs to direct light at the record. At the last vertex ``tail(si,
     bsdf, active, sampler)`` stands for R without N: an estimate from the cache (self-training), or 0.
 
-    Returns ``n_paths * (n_vertices - 1)`` records, and how many targets were not finite and were left out.
+    Returns ``n_paths * (n_vertices - 1)`` records, and how many were left out because not all of them was finite.
     """
     n_kept = n_vertices - 1
     size = n_paths * n_kept
@@ -143,8 +160,4 @@ def trace_training_paths(
         dr.scatter(records.target, R, i)
         R = dr.gather(mi.Color3f, N, i) + dr.gather(mi.Color3f, f, i) * (dr.gather(mi.Color3f, E, i) + R)
 
-    finite = dr.all(dr.isfinite(records.target))
-    n_bad = dr.count(records.valid & ~finite)
-    records.valid &= finite
-    records.target = dr.select(records.valid, records.target, 0)
-    return records, n_bad
+    return records, leave_out_nonfinite(records)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import vertex
-from .records import MAX_CHAIN, TrainingRecords, empty_records
+from .records import MAX_CHAIN, TrainingRecords, empty_records, leave_out_nonfinite
 from .samples import PathSampler
 from .termination import PathSpread
 
@@ -324,9 +324,8 @@ def trace_suffixes(
     n_bad = dr.count(records.valid & ~finite)
     records.valid &= finite
     records.target = dr.select(records.valid, records.target, 0)
-    finite = dr.all(dr.isfinite(arrived))
-    arrived = dr.select(finite, arrived, 0)
-    incident = TrainingRecords(records.surface.position, direction, records.surface.normal, arrived, rough & finite)
+    incident = TrainingRecords(records.surface.position, direction, records.surface.normal, arrived, rough)
+    leave_out_nonfinite(incident)
     return records, n_bad, Bounces(N + f * E, f, incident, stops), said
 
 
