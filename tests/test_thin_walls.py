@@ -53,7 +53,8 @@ def of_the_housing(scene) -> np.ndarray:
 
 @pytest.mark.parametrize("settings", [
     {"type": "nirc", "termination": "primary", "train_frames": 300},
-    {"type": "nirc", "termination": "primary", "blend": "fast", "train_frames": 150},
+    pytest.param({"type": "nirc", "termination": "primary", "blend": "fast", "train_frames": 150},
+                 marks=pytest.mark.slow),
     {"type": "nrc", "spread_threshold": 0.0, "train_frames": 150},
 ], ids=["nirc", "blend", "nrc"])  # fmt: skip
 def test_light_inside_a_housing_of_no_thickness_stays_there(settings):
