@@ -54,6 +54,21 @@ def variant() -> str:
 
 
 @pytest.fixture
+def full_disk(monkeypatch):
+    """Call it with `savez` or `replace`: writing a cache file fails half-way, or when it is put in its place."""
+
+    def fail(first, *_, **__):
+        if hasattr(first, "write"):
+            first.write(b"half a fi")
+        raise OSError("disk full")
+
+    def fill(where: str):
+        monkeypatch.setattr(*{"savez": (np, "savez"), "replace": (os, "replace")}[where], fail)
+
+    return fill
+
+
+@pytest.fixture
 def rng() -> np.random.Generator:
     """NumPy's generator with a fixed seed."""
     return np.random.default_rng(0)

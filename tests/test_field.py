@@ -457,16 +457,10 @@ def test_pickles_are_refused_and_not_executed(saved, tmp_path):
 
 
 @pytest.mark.parametrize("where", ["savez", "replace"])
-def test_failed_save_leaves_the_old_file_and_no_other(saved, monkeypatch, where):
+def test_failed_save_leaves_the_old_file_and_no_other(saved, full_disk, where):
     field, file = saved
     before = file.read_bytes()
-
-    def fail(first, *_, **__):
-        if where == "savez":
-            first.write(b"half a fi")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(*{"savez": (np, "savez"), "replace": (os, "replace")}[where], fail)
+    full_disk(where)
     with pytest.raises(OSError, match="disk full"):
         field.save(file)
     assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]

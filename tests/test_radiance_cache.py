@@ -436,16 +436,10 @@ def test_file_with_an_impossible_part_is_refused(saved, change):
 
 
 @pytest.mark.parametrize("where", ["savez", "replace"])
-def test_failed_save_leaves_the_old_file_and_no_other(saved, monkeypatch, where):
+def test_failed_save_leaves_the_old_file_and_no_other(saved, full_disk, where):
     cache, file = saved
     before = file.read_bytes()
-
-    def fail(first, *_, **__):
-        if where == "savez":
-            first.write(b"half a fi")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(*{"savez": (np, "savez"), "replace": (os, "replace")}[where], fail)
+    full_disk(where)
     with pytest.raises(OSError, match="disk full"):
         cache.save(file)
     assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]

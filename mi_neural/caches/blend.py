@@ -69,12 +69,12 @@ class Blend:
 
     def encode(self, x, n) -> tuple:
         """What depends on the point alone, of either predictor where it counts."""
+        lifted = mi.Point3f(self.field.lift(x, n))
         if self.grid is None:
-            return None, None, self.field.features(self.fast, self.field.lift(x, n))
+            return None, None, self.field.features(self.fast, lifted)
         sigma, n_values = self.sigma(x, n), self.field.shape.n_encoded
-        x = mi.Point3f(self.field.lift(x, n))
         return sigma, *(
-            where_active(asks, (x,), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
+            where_active(asks, (lifted,), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
             for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))
         )
 
