@@ -13,7 +13,7 @@ import pytest
 from expectation import assert_mean
 
 from mi_neural import scenes
-from mi_neural.caches.field import Field, FieldShape
+from mi_neural.caches.field import Field, FieldShape, Weights
 from mi_neural.caches.incident import IncidentCache, Training, reflect, trace_records
 from mi_neural.transport import vertex
 from mi_neural.transport.samples import PathSampler
@@ -418,3 +418,11 @@ def test_normals_that_are_not_finite_spoil_no_training(type_):
     image = np.array(mi.render(scene, integrator=integrator, spp=4))
     found = integrator.statistics()
     assert np.isfinite(image).all() and found["recoveries"] == 0 and math.isfinite(found["loss"])
+
+
+def test_half_precision_trains_in_frozen_steps(monkeypatch, cube):
+    """As on a GPU: weights packed in half precision, and a frozen step that queries them while it trains them."""
+    monkeypatch.setattr(Weights.__init__, "__defaults__", (True,))
+    cache = IncidentCache(Training(n_paths=64, n_vertices=3), FieldShape(n_levels=2, width=16))
+    losses = [cache.train_frame(*cube) for _ in range(3)]
+    assert cache.field.averaged.half and np.isfinite(losses).all()

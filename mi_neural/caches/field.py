@@ -222,12 +222,12 @@ class Weights:
 
     def differentiable(self, inputs: list) -> list:
         """The MLP's outputs as floats, differentiable with respect to `inputs` and the tensors. Packs the latter."""
+        self.pack()  # for queries in the same step
         if self.half:
             n = dr.width(inputs)
             inputs = dr.concat([i + dr.zeros(mi.Float, n) for i in inputs])
             out = self.mlp(mi.TensorXf(inputs, shape=(dr.width(inputs) // n, n)))
             return [out[i, :].array for i in range(out.shape[0])]
-        self.pack()
         layers = self.packed.layers
         return dr.custom(backprop.Perceptron, inputs, dict(self.mlp.items()), lambda: (layers, self.n_first))
 
