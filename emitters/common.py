@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mi_neural import plan
 from mi_neural.lights.table import LightTable
-from mi_neural.transport.identity import SceneWatch
+from mi_neural.render.binding import SceneWatch
 
 
 class LightSampler(mi.Emitter):

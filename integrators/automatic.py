@@ -10,9 +10,8 @@ import mitsuba as mi
 
 from mi_neural.caches.blend import sigma_channels, where_active
 from mi_neural.caches.incident import reflect
-from mi_neural.integrators import prefix
-from mi_neural.transport import vertex
-from mi_neural.transport.suffixes import surface_of
+from mi_neural.render import prefix, vertex
+from mi_neural.render.surface import scene_is_glossy, surface_of
 
 #: Queries a camera sample, at its first vertex and at its end; fewer where only one of them is asked, more where the
 #: end is in the incident cache.
@@ -50,40 +49,45 @@ def estimate(integrator, scene, lights, field, sampler, ray, n_samples, active):
     image. The first share w depends on nothing but the place, so E[L] is right wherever the two estimates are.
     """
     cached = integrator.needs_cache and field is not None
+    glossy = scene_is_glossy(scene)
 
     def stop(si, spread, smooth, first, sampler):
         share, incident = field.accuracy.choose(si.p, vertex.facing(si), n_samples, smooth)
-        incident &= ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)  # whose reflections the cache is not asked for
+        incident &= ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)  # its reflections are not in the cache
         wide = smooth & ~first & spread.exceeds(integrator.spread_threshold)
         ends = wide & (sampler.next_1d() < field.accuracy.stops(si.p, n_samples, wide))
-        return share, ends, incident & (first | wide) & ~ends
+        return share, ends, incident & (first | wide) & ~ends, sampler
 
-    path = prefix.trace(integrator, scene, lights, sampler, ray, active, stop if cached else None, look=cached)
-    depth, zero = dr.select(path.visible, mi.Float(path.depth), 0), mi.Color3f(0)
-    channels = {"traced": path.L, "cached": zero, "cache": zero, "density": mi.Float(0), "share": path.share,
-                "depth": depth, **sigma_channels(None, None, None)}  # fmt: skip
+    end, sampler = prefix.trace(
+        integrator, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=cached
+    )
+    path, zero = end.path, mi.Color3f(0)
+    channels = {"traced": path.L, "cached": zero, "cache": zero, "density": mi.Float(0),
+                "depth": dr.select(path.valid, mi.Float(path.depth), 0),
+                "share": end.share if cached else mi.Float(0), **sigma_channels(None, None, None)}  # fmt: skip
     if not cached:
-        return path.L, path.visible, channels
+        return path.L, path.valid, channels
 
     def outgoing(*inputs):
         return tuple(field.outgoing.query(*inputs))
 
     shows = bool({"cache", "density"} & set(integrator.channels))
-    seen = (dr.max(path.β_first) > 0) & ((path.share > 0) | shows)
-    at_first = path.β_first * mi.Color3f(*where_active(seen, path.first.inputs(), outgoing, 3))
-    at_end = surface_of(path.si, path.si.bsdf(path.ray), path.ends, path.glossy)
-    at_end = mi.Color3f(*where_active(path.ends, at_end.inputs(), outgoing, 3))
+    seen = (dr.max(end.β_first) > 0) & ((end.share > 0) | shows)
+    at_first = end.β_first * mi.Color3f(*where_active(seen, end.first.inputs(), outgoing, 3))
+    bsdf = path.si.bsdf(path.ray)
+    at_end = surface_of(path.si, bsdf, end.ends, glossy)
+    at_end = mi.Color3f(*where_active(end.ends, at_end.inputs(), outgoing, 3))
 
-    lit = path.ends_lit
+    lit = end.ends_lit
     point = mi.Point3f(path.si.p), vertex.facing(path.si)
     features = where_active(
         lit, point, lambda x, n: tuple(field.incident.encode(x, n)), field.incident.shape.n_encoded
     )
-    by_incident = reflect(
-        field.incident, list(features), path.si, path.si.bsdf(path.ray), integrator.cache.n_queries, sampler, lit
+    by_incident, sampler = reflect(
+        field.incident, list(features), path.si, bsdf, integrator.cache.n_queries, sampler, lit
     )
-    cached = path.share * at_first + path.β * (dr.select(path.ends, at_end, 0) + dr.select(lit, by_incident, 0))
+    cached = end.share * at_first + path.β * (dr.select(end.ends, at_end, 0) + dr.select(lit, by_incident, 0))
     channels |= {"cached": cached, "cache": at_first}
     if shows:
-        channels["density"] = dr.select(seen, field.outgoing.density_at(path.first.position), 0)
-    return path.L + cached, path.visible, channels
+        channels["density"] = dr.select(seen, field.outgoing.density_at(end.first.position), 0)
+    return path.L + cached, path.valid, channels

@@ -21,9 +21,10 @@ from mi_neural.integrators import planning
 from mi_neural.integrators.checks import check_film, check_scene, sensor_of
 from mi_neural.integrators.keys import SHARED_KEYS as SHARED_KEYS
 from mi_neural.integrators.lighting import light_sampler_of
-from mi_neural.transport.freezing import undisturbed
-from mi_neural.transport.identity import SceneWatch
-from mi_neural.transport.samples import PathSampler
+from mi_neural.render import path as paths
+from mi_neural.render.binding import SceneWatch
+from mi_neural.render.frozen import undisturbed
+from mi_neural.render.sampling import PathSampler
 
 #: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (measured, README).
 PASS_SAMPLES = 2**20
@@ -64,6 +65,11 @@ def _sums(values: list, first, stride: int, count) -> list:
         return k + 1, *(s + dr.gather(mi.Float, v, first + k * stride) for s, v in zip(sums, values, strict=True))
 
     return list(dr.while_loop((mi.UInt32(0), *zeros), lambda k, *_: k < count, add, label="samples of a pixel")[1:])
+
+
+def coverage(valid):
+    """Share of a sample that covers its pixel, from a mask or from that share."""
+    return dr.select(valid, mi.Float(1), 0) if dr.is_mask_v(valid) else mi.Float(valid)
 
 
 def _in_keys(message: str) -> str:
@@ -194,6 +200,11 @@ class CacheIntegrator(mi.SamplingIntegrator):
     @property
     def queries_per_sample(self) -> float:
         return 0.0
+
+    @property
+    def depth_limit(self) -> int:
+        """`max_depth` as a number to compare depths with."""
+        return paths.depth_limit(self.max_depth)
 
     # -------------------------------------------------------------------------------------------------------------
     # State
@@ -551,7 +562,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             L = dr.select(ok, L, 0)
             values = [L.x, L.y, L.z]
             if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-                values.append(dr.select(valid, mi.Float(1), 0))
+                values.append(coverage(valid))
             values.append(dr.select(ok & active, mi.Float(1), 0))
             for name in self.channels:
                 value = extra[name]
@@ -580,7 +591,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         aovs = []
         for name in self.channels:
             aovs += list(extra[name]) if self.CHANNELS[name] == 3 else [extra[name]]
-        return L, valid, aovs
+        return L, own.next_1d() < coverage(valid), aovs
 
     def aov_names(self):
         return [f"{n}.{c}" if self.CHANNELS[n] == 3 else n for n in self.channels

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.integrators.checks import check_film, check_scene, sensor_of
-from mi_neural.transport.freezing import can_freeze, undisturbed
-from mi_neural.transport.identity import SceneWatch
+from mi_neural.render.binding import SceneWatch
+from mi_neural.render.frozen import can_freeze, undisturbed
 
 #: Most camera samples traced at once: what Ctrl-C has to wait for, some seconds.
 PASS_SAMPLES = 2**22

@@ -1,5 +1,9 @@
 """``nirc``: paths that end in a neural incident radiance cache."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,14 +15,15 @@ from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
 from mi_neural.caches.pair import PairCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
+from mi_neural.estimators import spread
 from mi_neural.integrators import automatic
 from mi_neural.integrators.automatic import AUTO
 from mi_neural.integrators.common import CacheIntegrator
-from mi_neural.integrators.first_vertex import first_vertex
 from mi_neural.integrators.keys import SHARED_KEYS
 from mi_neural.integrators.planning import SIZES
-from mi_neural.transport import termination, vertex
-from mi_neural.transport.samples import PathSampler
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+from mi_neural.render.sampling import PathSampler
 
 #: Caches of incident radiance without a network
 CONTROLS = {"spatial_hash": SpatialHashCache, "sh_grid": HarmonicCache}
@@ -26,8 +31,19 @@ TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "auto")
 #: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
 #: the cache's directional detail does not suffice for it.
 SHARP_PDF = 3.0
-#: Dimensions of the stratified numbers
-AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE, LIGHT = range(7)
+#: Dimensions of the stratified numbers of cache samples
+EXTRA, EXTRA_LOBE = range(paths.FREE, paths.FREE + 2)
+
+
+@dataclass
+class Traced:
+    """Sums over the traced samples of a first vertex: direct light, what is gathered beyond the cache's answers, rays
+    beyond those of direct light, and pixels covered."""
+
+    direct: mi.Color3f
+    residual: mi.Color3f
+    n_rays: mi.UInt32
+    covered: mi.Float
 
 
 class NIRCIntegrator(CacheIntegrator):
@@ -127,28 +143,22 @@ class NIRCIntegrator(CacheIntegrator):
         n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
-        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(AA), mi.Point2f(0.5))
-        L, β, ray, si, _, _, active, sampler = first_vertex(self, scene, sampler, ray, mi.Bool(True))
-        bsdf = si.bsdf(ray)
+        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(0), mi.Point2f(0.5))
+        path = paths.camera_vertex(self, scene, ray, mi.Bool(True))
+        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
 
         def once(k, mean, square, sampler):
-            bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active)
-            direct, Le = vertex.emitted(
-                scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
-                active,
-            )  # fmt: skip
-            direct = dr.mean(vertex.finite(β * (direct + vertex.finite(weight * Le, active)), active))
+            found, sampler = paths.bounce(scene, lights, path, sampler)
+            direct = dr.mean(vertex.finite(path.β * found.direct, path.active))
             return k + 1, mean + 0.25 * direct, square + 0.25 * dr.square(direct), sampler
 
         _, mean, square, sampler = dr.while_loop(
             (mi.UInt32(0), mi.Float(0), mi.Float(0), sampler), lambda k, *_: k < 4, once
         )
-        dr.eval(mean, square, L)  # one kernel, not one for each
+        dr.eval(mean, square, path.L)  # one kernel, not one for each
         variance = np.array(dr.maximum(square - dr.square(mean), 0)) * (4 / 3)
         # Relative to the brightness of the place, the scene's mean being its floor
-        level = float(np.mean(np.array(mean + dr.mean(L))))
+        level = float(np.mean(np.array(mean + dr.mean(path.L))))
         if self.cache.field is not None:
             level += float(self.cache.field.scale[0])
         noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
@@ -180,155 +190,142 @@ class NIRCIntegrator(CacheIntegrator):
             names = {"direct": "traced", "cache": "cached", "depth": "depth", "share": "share"}
             empty = {n: mi.Color3f(0) if k == 3 else mi.Float(0) for n, k in self.CHANNELS.items()}
             return L, visible, empty | {name: c[theirs] for name, theirs in names.items()}
-        L, β, ray, si, depth, visible, active, sampler = first_vertex(self, scene, sampler, ray, active)
-        bsdf = si.bsdf(ray)
-        n_light = self.n_light
-        cached = self.needs_cache and field is not None
-        features = field.encode(si.p, vertex.facing(si)) if cached else None
-        a_0 = termination.camera_spread(dr.squared_norm(si.p - ray.o), dr.dot(si.n, ray.d))
+        path = paths.camera_vertex(self, scene, ray, active)
+        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
+        si, active, n_light = path.si, path.active, self.n_light
+        bsdf = si.bsdf(path.ray)
+        features = field.encode(si.p, vertex.facing(si)) if self.cached(field) else None
 
-        # Of the traced samples, so many gather what lies far: as few as the share allows, to save the rest their rays
+        # ---------------- Samples with a ray: direct light, and what the ray meets ----------------
+        traced, cache, sampler = self.traced_samples(scene, lights, field, features, path, bsdf, mixture, sampler)
+
+        # -------------------------- Samples of the cache without a ray ----------------------------
+        if features is not None:
+            more, sampler = self.cache_samples_only(field, features, si, bsdf, sampler, active)
+            cache = (cache + more) / max(self.cache_samples, n_light)
+        direct, residual = traced.direct / n_light, traced.residual / n_light
+        L = path.L + dr.select(active, path.β * (direct + cache + residual), 0)
+        coverage = dr.select(active, traced.covered / n_light, dr.select(path.valid, 1.0, 0.0))
+
+        channels = {"direct": path.β * direct, "cache": path.β * cache, "residual": path.β * residual}
+        channels |= {"depth": path.depth + mi.Float(traced.n_rays) / n_light, "share": mi.Float(0)}
+        channels |= sigma_channels(field if features is not None else None, si.p, vertex.facing(si))
+        return L, coverage, {k: dr.select(active, v, 0) for k, v in channels.items()}
+
+    def cached(self, field) -> bool:
+        """Whether the cache is queried at all."""
+        return self.needs_cache and field is not None
+
+    def traced_samples(self, scene, lights, field, features, path, bsdf, mixture, sampler):
+        """Sums over `n_light` BSDF samples that are traced: (:class:`Traced`, cache's answers, sampler)."""
+        si, active, n_light = path.si, path.active, self.n_light
+        here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
+        a_0 = spread.camera_spread(dr.squared_norm(si.p - path.ray.o), dr.dot(si.n, path.ray.d))
+        # Of these samples, so many gather what lies far: as few as the share allows, to save the others their rays
         n_gather = dr.clip(dr.ceil(mixture * n_light), 1, n_light)
-        zero = mi.Color3f(0)
-        state = (mi.UInt32(0), mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero), mi.UInt32(0), sampler)
 
-        def traced_sample(i, direct, cache, residual, n_rays, sampler):
-            # ------------------- One BSDF sample ----------------------
-            bs, weight = bsdf.sample(
-                mi.BSDFContext(), si, sampler.stratified_1d(LOBE, n_light, i),
-                sampler.stratified_2d(BSDF, n_light, i), active,
-            )  # fmt: skip
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            weight = vertex.finite(weight, active)
-            wo = si.to_world(bs.wo)
-            next_ray = si.spawn_ray(wo)
-            alive = active & (dr.max(weight) > 0) & (self.max_depth != 1)
-
-            # ------------ What the cache says of its direction --------
+        def sample(i, traced, cache, sampler):
+            numbers = paths.stratified(sampler, n_light, i)
+            found, sampler = paths.bounce(scene, lights, here, sampler, numbers, bsdf=bsdf)
             Li_cache = mi.Color3f(0)
-            if cached:
-                Li_cache = dr.select(alive & ~delta, weight * field.query(features, wo), 0)
-                cache += Li_cache
+            if features is not None:
+                smooth = found.followed & ~found.delta
+                Li_cache = dr.select(smooth, found.weight * field.query(features, found.ray.d), 0)
 
-            # ---- Direct light: by next-event estimation, and what is there
-            si_next = scene.ray_intersect(next_ray, alive)
-            L_nee, Le = vertex.emitted(
-                scene, lights, si, bsdf, sampler.stratified_1d(LIGHT, n_light, i),
-                sampler.stratified_2d(NEE, n_light, i), sampler, active, si_next, bs.pdf, delta, alive,
-            )  # fmt: skip
-            direct += L_nee + weight * Le
-
-            # --------------- What is there: reflection ----------------
-            spread = dr.select(
-                delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
-            )
+            # ------------------ Reflection by what the ray met --------------------
+            cos_theta = dr.dot(found.si.n, found.ray.d)
+            width = dr.select(found.delta, 0, spread.segment_spread(found.si.t**2, found.bs.pdf, cos_theta))
             far = dr.select(mi.Float(i) < n_gather, mixture * n_light / n_gather, 0)
-            share = self.gather_share(delta, bs.pdf, spread, a_0, far) if cached else mi.Float(1)
-            follow = alive & (share > 0) & si_next.is_valid()
-            Li, more, sampler = self.gather(
-                scene, lights, field, sampler, next_ray, si_next, depth + 1, weight, bs, spread, a_0, follow
+            share = mi.Float(1)
+            if features is not None:
+                share = self.gather_share(found.delta, found.bs.pdf, width, a_0, far)
+            beyond = replace(paths.advance(here, found, self.depth_limit), L=mi.Color3f(0))
+            beyond.active &= share > 0
+            follows = mi.Bool(beyond.active)
+            beyond, n_rays, sampler = self.gather(scene, lights, field, sampler, beyond, width, a_0, path.β)
+            return i + 1, Traced(
+                traced.direct + found.direct,
+                traced.residual + dr.select(found.followed, share * (beyond.L - Li_cache), 0),
+                traced.n_rays + dr.select(follows, n_rays + 1, 0),
+                traced.covered + dr.select(beyond.valid, 1, 0),
+            ), cache + Li_cache, sampler
+
+        none = Traced(mi.Color3f(0), mi.Color3f(0), mi.UInt32(0), mi.Float(0))
+        _, traced, cache, sampler = dr.while_loop(
+            (mi.UInt32(0), none, mi.Color3f(0), sampler), lambda i, *_: active & (i < n_light), sample,
+            label="traced samples",
+        )  # fmt: skip
+        return traced, cache, sampler
+
+    def cache_samples_only(self, field, features, si, bsdf, sampler, active):
+        """Sum of the cache's answers in the directions that are not traced: (sum, sampler)."""
+        n = max(self.cache_samples - self.n_light, 0)
+        if n == 0:
+            return mi.Color3f(0), sampler
+
+        def sample(i, cache, sampler):
+            bs, weight, delta = paths.sample_bsdf(
+                si, bsdf, sampler.stratified_1d(EXTRA_LOBE, n, i), sampler.stratified_2d(EXTRA, n, i), active
             )
-            residual += dr.select(alive, share * (Li - Li_cache), 0)
-            return i + 1, direct, cache, residual, n_rays + dr.select(follow, more + 1, 0), sampler
+            answer = weight * field.query(features, si.to_world(bs.wo))
+            return i + 1, cache + dr.select(delta, 0, answer), sampler
 
-        _, direct, cache, residual, n_rays, sampler = dr.while_loop(
-            state, lambda i, *_: active & (i < n_light), traced_sample, label="traced samples"
+        _, cache, sampler = dr.while_loop(
+            (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, *_: active & (i < n), sample, label="cache samples"
         )
+        return cache, sampler
 
-        # ------------------- Cache samples without a ray --------------
-        if cached:
-            n_extra = max(self.cache_samples - n_light, 0)
-
-            def cache_sample(i, cache, sampler):
-                bs, weight = bsdf.sample(
-                    mi.BSDFContext(), si, sampler.stratified_1d(EXTRA_LOBE, n_extra, i),
-                    sampler.stratified_2d(EXTRA, n_extra, i), active,
-                )  # fmt: skip
-                rough = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                weight = vertex.finite(weight, rough)
-                return i + 1, cache + weight * field.query(features, si.to_world(bs.wo)), sampler
-
-            if n_extra:
-                _, cache, sampler = dr.while_loop(
-                    (mi.UInt32(0), cache, sampler), lambda i, *_: active & (i < n_extra), cache_sample,
-                    label="cache samples",
-                )  # fmt: skip
-            cache /= n_light + n_extra
-        direct, residual = direct / n_light, residual / n_light
-        L += dr.select(active, β * (direct + cache + residual), 0)
-        channels = {"direct": β * direct, "cache": β * cache, "residual": β * residual}
-        channels |= {"depth": depth + mi.Float(n_rays) / n_light, "share": mi.Float(0)}
-        channels |= sigma_channels(field if cached else None, si.p, vertex.facing(si))
-        return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
-
-    def gather_share(self, delta, pdf, spread, a_0, far):
+    def gather_share(self, delta, pdf, width, a_0, far):
         """How much of a direction's light is gathered at what it meets, instead of read from the cache here.
 
         1 for delta and sharp lobes; 1 where the next surface is so near that the cache would blur what the pixel sees
-        (spread below its threshold), unless `termination` is ``primary``; elsewhere `far`, or by ``balanced`` its own.
+        (spread `width` below its threshold), unless `termination` is ``primary``; elsewhere `far`, or by ``balanced``
+        its own.
         """
         needed = delta | (pdf > SHARP_PDF)
         if self.termination != "primary":
-            needed |= ~termination.exceeds(spread, a_0, self.spread_threshold)
+            needed |= ~spread.exceeds(width, a_0, self.spread_threshold)
         share = far
         if self.termination == "balanced":
-            share = 1 - termination.balanced_probability(max(self.cache_samples, 1), pdf)
+            share = 1 - spread.balanced_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)
 
-    def gather(self, scene, lights, field, sampler, ray, si, depth, β, bs, spread, a_0, active):
-        """Light that `si`, `depth` segments from the camera, reflects back along `ray`, times β.
+    def gather(self, scene, lights, field, sampler, path, width, a_0, β_first):
+        """Light that ``path.si`` reflects back along ``path.ray``, times ``path.β``; in ``path.L`` of what is returned.
 
         Next-event estimation there, the rest from the cache at the first vertex where the path is wide enough, by path
-        tracing up to there. Returns (light, rays that were traced for more than direct light, sampler).
+        tracing up to there. `width`: square root of the path's spread. `β_first`: throughput up to where `path` began.
+        Returns (path, rays that were traced for more than direct light, sampler).
         """
-        ctx = mi.BSDFContext()
-        cached = self.needs_cache and field is not None
-        max_depth = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
-        active = active & (depth < max_depth)
+        cached = self.cached(field)
 
-        def one_vertex(depth, ray, si, β, η, L, spread, n_rays, active, sampler):
-            bsdf = si.bsdf(ray)
-            smooth = active & vertex.has_smooth(bsdf)
-            wide = smooth & termination.exceeds(spread, a_0, self.spread_threshold) if cached else mi.Bool(False)
-
-            # One more direction: ask the cache for its light, or follow it
-            bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            wo = si.to_world(bs.wo)
-            β_next = vertex.finite(β * weight, active)
-            stop = wide & ~delta & (bs.pdf <= SHARP_PDF)
+        def step(path, width, n_rays, sampler):
+            si = path.si
+            wide = mi.Bool(False)
             if cached:
-                L += dr.select(stop, β_next * field.query(field.encode(si.p, vertex.facing(si)), wo), 0)
-            η *= bs.eta
-            depth += 1
-            followed = active & ~stop & (dr.max(β_next) > 0)
-            roulette = depth >= self.rr_depth
-            q = dr.minimum(dr.max(β_next) * η**2, 0.95)
-            followed &= ~roulette | (sampler.next_1d() < q)
-            β_next = dr.select(roulette, β_next * dr.rcp(dr.maximum(q, 1e-6)), β_next)
+                wide = vertex.is_terminal(si, path.active) & spread.exceeds(width, a_0, self.spread_threshold)
 
-            # Direct light; next-event estimation shares the work only with rays that are followed
-            next_ray = si.spawn_ray(wo)
-            si_next = scene.ray_intersect(next_ray, followed)
-            L_nee, Le = vertex.emitted(
-                scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
-                followed, alone=lambda pdf: wide & (pdf <= SHARP_PDF),
-            )  # fmt: skip
-            L += β * L_nee + β_next * Le
-            β = β_next
-            active = followed & si_next.is_valid() & (depth < max_depth)
-            n_rays += dr.select(active, 1, 0)
-            spread += dr.select(
-                delta, 0, termination.segment_spread(si_next.t**2, bs.pdf, dr.dot(si_next.n, next_ray.d))
+            def stops(pdf):
+                return wide & (pdf <= SHARP_PDF)
+
+            # Next-event estimation shares the work only with rays that are followed
+            found, sampler = paths.bounce(
+                scene, lights, path, sampler, follow=lambda bs, delta: delta | ~stops(bs.pdf), alone=stops
             )
-            return depth, next_ray, si_next, β, η, L, spread, n_rays, active, sampler
+            after = paths.advance(path, found, self.depth_limit)
+            if cached:
+                stop = stops(found.bs.pdf) & ~found.delta
+                Li_cache = field.query(field.encode(si.p, vertex.facing(si)), found.ray.d)
+                after.L += dr.select(stop, path.β * found.weight * Li_cache, 0)
+            cos_theta = dr.dot(found.si.n, found.ray.d)
+            width += dr.select(found.delta, 0, spread.segment_spread(found.si.t**2, found.bs.pdf, cos_theta))
+            after, sampler = paths.roulette(after, sampler, self.rr_depth, β_first)
+            return after, width, n_rays + dr.select(after.active, 1, 0), sampler
 
-        state = (mi.UInt32(depth), mi.Ray3f(ray), si, mi.Color3f(β), mi.Float(bs.eta), mi.Color3f(0), mi.Float(spread),
-                 mi.UInt32(0), mi.Bool(active), sampler)  # fmt: skip
-        _, _, _, _, _, L, _, n_rays, _, sampler = dr.while_loop(
-            state, lambda *state: state[8], one_vertex, label="gather"
+        path, _, n_rays, sampler = dr.while_loop(
+            (path, mi.Float(width), mi.UInt32(0), sampler), lambda path, *_: path.active, step, label="gather"
         )
-        return L, n_rays, sampler
+        return path, n_rays, sampler
 
     def to_string(self):
         return (

@@ -1,16 +1,22 @@
 """``nirc_two_level``: the incident radiance cache as a control variate, unbiased for any cache."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mi_neural.caches.control import ControlCache
+from mi_neural.estimators import two_level
 from mi_neural.integrators import pilot, progressive
 from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
-from mi_neural.integrators.first_vertex import first_vertex
 from mi_neural.integrators.pilot import Split
 from mi_neural.integrators.progressive import UNBIASED, Parts
-from mi_neural.transport import two_level, vertex
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
 
 MODES = ("unbiased", "progressive")
 #: A lobe that sends a sample with a density above this (per steradian) is always traced, and never by the cache.
@@ -19,8 +25,8 @@ SHARP_PDF = 3.0
 DEFENSIVE = 0.25
 #: Queries per vertex with `every_vertex`: the direction that is followed, and another.
 INNER = 2
-#: Dimensions of the stratified numbers
-AA, NEE, BSDF, LOBE, EXTRA, EXTRA_LOBE, LIGHT, KEPT = range(8)
+#: Dimensions of the stratified numbers of cache samples, and of the number that decides which are traced
+EXTRA, EXTRA_LOBE, KEPT = range(paths.FREE, paths.FREE + 3)
 #: Dimensions of the numbers that decide together, from here on one for each depth of each traced path
 TOGETHER = 16
 
@@ -187,183 +193,97 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
     def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] is path tracing's, whatever the cache: direct light + :func:`two_level.combine` at the first vertex."""
         n_traced, n_cache, probability, alpha = settings
-        L, β, ray, si, depth, visible, active, sampler = first_vertex(self, scene, sampler, ray, active)
-        bsdf = si.bsdf(ray)
+        path = paths.camera_vertex(self, scene, ray, active)
+        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
+        helps = (n_cache > n_traced) | (probability < 1)  # elsewhere the cache's terms cancel
+        first = _FirstVertex(self, field, path, alpha, helps, n_cache)
+        beyond = partial(self.suffix, scene, lights, field, alpha=alpha, β_first=path.β)
 
-        # ----------- How far the cache is believed here; where its terms would cancel, it is not asked
-        α, features = mi.Float(0), None
-        if self.choice.may_ask and field is not None:
-            cancels = (n_cache <= n_traced) & (probability >= 1)
-            asked = active & vertex.has_smooth(bsdf) & ~cancels
-            α = self.coefficient(field, si, alpha, asked)
-            asked &= (α > 0) | (mi.Bool(self.ris) & (n_cache > 1))
-            features = field.encode(si.p, vertex.facing(si), asked)
-        else:
-            asked = mi.Bool(False)
-
-        def candidate(dimension, dimension_lobe, n, i):
-            """A BSDF sample, its weight, and what the cache says of it."""
-            bs, weight = bsdf.sample(
-                mi.BSDFContext(), si, sampler.stratified_1d(dimension_lobe, n, i),
-                sampler.stratified_2d(dimension, n, i), active,
-            )  # fmt: skip
-            weight = vertex.finite(weight, active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            cached = mi.Color3f(0)
-            if features is not None:
-                asks = asked & ~delta & (bs.pdf <= SHARP_PDF)
-                cached = dr.select(asks, weight * field.query(features, si.to_world(bs.wo), asks), 0)
-            return bs, weight, delta, vertex.finite(cached, active)
-
-        def traced_sample(i, direct, cache, residual, sampler, kept=None):
-            if kept is None:
-                bs, weight, delta, cached = candidate(BSDF, LOBE, mi.UInt32(n_traced), i)
-                cache += cached
-            else:
-                bs, weight, delta, cached = kept
-            next_ray = si.spawn_ray(si.to_world(bs.wo))
-            alive = active & (dr.max(weight) > 0)
-
-            # ---- Direct light: by next-event estimation, and what is there
-            si_next = scene.ray_intersect(next_ray, alive)
-            L_nee, Le = vertex.emitted(
-                scene, lights, si, bsdf, sampler.stratified_1d(LIGHT, mi.UInt32(n_traced), i),
-                sampler.stratified_2d(NEE, mi.UInt32(n_traced), i), sampler, active, si_next, bs.pdf, delta, alive,
-            )  # fmt: skip
-            direct += L_nee + weight * Le
-
-            # ------------ Indirect light: traced or not ---------------
-            q = dr.select(delta | (bs.pdf > SHARP_PDF), 1, probability)
-            keep = active & (sampler.together_1d(KEPT) < q)
-            follow = keep & alive & si_next.is_valid() & (depth + 1 < self._max_depth)
-            traced, sampler = self.suffix(
-                scene, lights, field, sampler, next_ray, si_next, depth + 1, weight, β, bs.eta, alpha,
-                mi.UInt32(i) * 64 + TOGETHER, follow,
-            )  # fmt: skip
-            residual += two_level.residual(traced, cached, α, q, keep)
-            return i + 1, direct, cache, residual, sampler
-
-        zero = mi.Color3f(0)
-        direct, cache, residual = mi.Color3f(zero), mi.Color3f(zero), mi.Color3f(zero)
+        none = Sums(*(mi.Color3f(0) for _ in range(3)), mi.Float(0))
         if self.ris:
             # One candidate is kept as it is: path tracing
             n_candidates = mi.UInt32(dr.maximum(n_cache, 1))
-            cache, kept, sampler = self.resampled(candidate, field, n_candidates, sampler, active)
-            _, direct, _, residual, sampler = traced_sample(mi.UInt32(0), direct, zero, residual, sampler, kept)
-        else:
-            _, direct, cache, residual, sampler = dr.while_loop(
-                (mi.UInt32(0), direct, cache, residual, sampler),
-                lambda i, *_: active & (mi.Float(i) < n_traced), traced_sample, label="traced samples",
-            )  # fmt: skip
-            # ----------------- Cache samples without a ray ----------------
-            n_extra = mi.UInt32(dr.maximum(n_cache - n_traced, 0))
-
-            def cache_sample(i, cache):
-                return i + 1, cache + candidate(EXTRA, EXTRA_LOBE, n_extra, i)[3]
-
-            _, cache = dr.while_loop(
-                (mi.UInt32(0), cache), lambda i, cache: asked & (i < n_extra), cache_sample, label="cache samples"
+            cache, kept, sampler = first.resampled(n_candidates, sampler)
+            sums, sampler = first.traced_sample(
+                scene, lights, mi.UInt32(0), mi.UInt32(n_traced), probability, none, sampler, beyond, kept
             )
-        n_asked = n_cache if self.ris else dr.maximum(n_cache, n_traced)
-        indirect = two_level.combine(cache, n_asked, residual, n_traced, α)
-        direct = direct / n_traced
-        L += dr.select(active, β * (direct + indirect), 0)
+            sums.cache = cache
+        else:
+            def sample(i, sums, sampler):
+                sums, sampler = first.traced_sample(
+                    scene, lights, i, mi.UInt32(n_traced), probability, sums, sampler, beyond
+                )
+                return i + 1, sums, sampler
 
-        cache_part = indirect - residual / n_traced
-        channels = {
-            "direct": β * direct, "cache": β * cache_part, "residual": β * residual / n_traced, "alpha": α,
-            # Squares; variances once all samples of a pixel are there
-            "variance_cache": dr.square(β * cache_part), "variance_residual": dr.square(β * residual / n_traced),
-            "variance_indirect": dr.square(β * indirect),
+            _, sums, sampler = dr.while_loop(
+                (mi.UInt32(0), none, sampler), lambda i, *_: path.active & (mi.Float(i) < n_traced), sample,
+                label="traced samples",
+            )  # fmt: skip
+            sums.cache += first.cache_samples_only(mi.UInt32(dr.maximum(n_cache - n_traced, 0)), sampler)
+        n_queries = n_cache if self.ris else dr.maximum(n_cache, n_traced)
+        indirect = two_level.combine(sums.cache, n_queries, sums.residual, n_traced, first.α)
+        direct, residual = sums.direct / n_traced, sums.residual / n_traced
+        L = path.L + dr.select(path.active, path.β * (direct + indirect), 0)
+        coverage = dr.select(path.active, sums.covered / n_traced, dr.select(path.valid, 1.0, 0.0))
+        return L, coverage, self._channels(path, direct, indirect, residual, first.α)
+
+    def _channels(self, path, direct, indirect, residual, α) -> dict:
+        """What the channels show; squares in the place of variances until all samples of a pixel are there."""
+        cache = indirect - residual
+        values = {
+            "direct": path.β * direct, "cache": path.β * cache, "residual": path.β * residual, "alpha": α,
+            "variance_cache": dr.square(path.β * cache), "variance_residual": dr.square(path.β * residual),
+            "variance_indirect": dr.square(path.β * indirect),
         }  # fmt: skip
-        return L, visible, {k: dr.select(active, v, 0) for k, v in channels.items()}
-
-    @property
-    def _max_depth(self) -> int:
-        return self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
+        return {k: dr.select(path.active, v, 0) for k, v in values.items()}
 
     def coefficient(self, field, si, alpha, active):
         """α at a vertex: `alpha` itself, or by place where it is negative; 0 where not `active`."""
         by_place = active & (alpha < 0)
         return dr.select(active, dr.select(by_place, field.alpha_at(si.p, vertex.facing(si), by_place), alpha), 0)
 
-    def resampled(self, candidate, field, n, sampler, active):
-        """One of `n` directions, kept in proportion to what the cache says comes from there: (sum of what it says,
-        (BSDF sample, weight, delta, cached) with the RIS weight in both, sampler)."""
-        defensive = DEFENSIVE * (field.scale if field is not None else mi.Float(1))
-
-        def consider(i, cache, t_sum, t_kept, bs, weight, delta, cached, sampler):
-            new = candidate(EXTRA, EXTRA_LOBE, n, i)
-            t = two_level.resampling_target(new[3], new[1], defensive)
-            t_sum += t
-            take = sampler.next_1d() * t_sum < t
-            bs, weight, delta, cached = (
-                dr.select(take, a, b) for a, b in zip(new, (bs, weight, delta, cached), strict=True)
-            )
-            return i + 1, cache + new[3], t_sum, dr.select(take, t, t_kept), bs, weight, delta, cached, sampler
-
-        zero = mi.Float(0)
-        state = (mi.UInt32(0), mi.Color3f(0), zero, mi.Float(zero), dr.zeros(mi.BSDFSample3f), mi.Color3f(0),
-                 mi.Bool(False), mi.Color3f(0), sampler)  # fmt: skip
-        _, cache, t_sum, t, bs, weight, delta, cached, sampler = dr.while_loop(
-            state, lambda i, *_: active & (i < n), consider, label="candidates"
-        )
-        w = two_level.resampling_weight(t_sum, mi.Float(n), t)
-        return cache, (bs, w * weight, delta, w * cached), sampler
-
-    def suffix(self, scene, lights, field, sampler, ray, si, depth, weight, β_first, η, alpha, dimension, active):
-        """``weight`` times the light that `si`, `depth` segments from the camera, reflects back along `ray`.
+    def suffix(self, scene, lights, field, path, sampler, dimension, *, alpha, β_first):
+        """Light that ``path.si`` reflects back along ``path.ray``, times ``path.β``; in ``path.L`` of the result.
 
         Path tracing; with `every_vertex` the cache is a control variate at each vertex. Roulette is by the throughput
-        from the camera, `β_first` `weight` at `si`.
+        from the camera, `β_first` up to where `path` began. Returns (path, sampler).
         """
-        ctx = mi.BSDFContext()
+        controls = self.every_vertex and self.choice.may_ask and field is not None
 
-        def bounce(depth, ray, si, β, η, L, active, sampler):
-            bsdf = si.bsdf(ray)
-            bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
-            weight = vertex.finite(weight, active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            wo = si.to_world(bs.wo)
-            next_ray = si.spawn_ray(wo)
-            alive = active & (dr.max(weight) > 0)
-            si_next = scene.ray_intersect(next_ray, alive)
-            L_nee, Le = vertex.emitted(
-                scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
-                alive,
-            )  # fmt: skip
-            L += β * (L_nee + weight * Le)
+        def step(path, sampler):
+            found, sampler = paths.bounce(scene, lights, path, sampler)
+            after = paths.advance(path, found, self.depth_limit)
+            u = sampler.together_1d(dimension + after.depth)
+            if controls:
+                q = paths.survival(after, self.rr_depth, β_first)
+                L, sampler = self.control(field, path, found, alpha, u < q, q, sampler)
+                after.L += path.β * L
+            return paths.roulette(after, sampler, self.rr_depth, β_first, u)
 
-            # Roulette (must cancel out η² to obtain unitless throughput)
-            β_next, η = β * weight, η * bs.eta
-            depth = depth + 1
-            q = dr.minimum(dr.max(β_first * β_next) * η**2, 0.95)
-            q = dr.select(depth > self.rr_depth, q, 1)
-            kept = active & (sampler.together_1d(dimension + depth) < q)
-            inv_q = dr.rcp(dr.maximum(q, 1e-6))
+        return dr.while_loop(
+            (path, sampler), lambda path, sampler: path.active, step, label="residual path"
+        )
 
-            if self.every_vertex and self.choice.may_ask and field is not None:
-                asked = active & vertex.has_smooth(bsdf)
-                α = self.coefficient(field, si, alpha, asked)
-                asked &= α > 0
-                features = field.encode(si.p, vertex.facing(si), asked)
-                said = asked & ~delta & (bs.pdf <= SHARP_PDF)
-                followed = vertex.finite(weight * field.query(features, wo, said), said)
-                bs_2, weight_2 = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), asked)
-                rough = asked & ~mi.has_flag(bs_2.sampled_type, mi.BSDFFlags.Delta) & (bs_2.pdf <= SHARP_PDF)
-                other = vertex.finite(weight_2 * field.query(features, si.to_world(bs_2.wo), rough), rough)
-                zero = mi.Color3f(0)
-                cancels = two_level.residual(zero, followed, α, 1 / inv_q, kept)
-                L += β * two_level.combine(followed + other, mi.Float(INNER), cancels, 1, α)
+    def control(self, field, path, found, alpha, kept, q, sampler):
+        """The cache as a control variate at a vertex whose path goes on, where `kept`, with probability q: E = 0.
 
-            β = β_next * inv_q
-            active = kept & alive & si_next.is_valid() & (depth < self._max_depth) & (dr.max(β) > 0)
-            return depth, next_ray, si_next, β, η, L, active, sampler
+        `INNER` queries: in the direction of the path, and in another. Returns (radiance, sampler).
+        """
+        si = path.si
+        bsdf = si.bsdf(path.ray)
+        queries = vertex.is_smooth(si, path.active)
+        α = self.coefficient(field, si, alpha, queries)
+        queries &= α > 0
+        features = field.encode(si.p, vertex.facing(si), queries)
 
-        state = (mi.UInt32(depth), mi.Ray3f(ray), si, mi.Color3f(weight), mi.Float(η), mi.Color3f(0), mi.Bool(active),
-                 sampler)  # fmt: skip
-        *_, L, _, sampler = dr.while_loop(state, lambda *s: s[6], bounce, label="residual path")
-        return L, sampler
+        def answer(bs, weight, delta):
+            smooth = queries & ~delta & (bs.pdf <= SHARP_PDF)
+            return vertex.finite(weight * field.query(features, si.to_world(bs.wo), smooth), smooth)
+
+        followed = answer(found.bs, found.weight, found.delta)
+        other = answer(*paths.sample_bsdf(si, bsdf, sampler.next_1d(), sampler.next_2d(), queries))
+        cancels = two_level.residual(mi.Color3f(0), followed, α, q, kept)
+        return two_level.combine(followed + other, mi.Float(INNER), cancels, 1, α), sampler
 
     def to_string(self):
         return (
@@ -372,6 +292,97 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
             f"  frames trained = {self.cache.steps}\n]"
         )
+
+
+@dataclass
+class Sums:
+    """Sums over the traced samples of a first vertex: direct light, the cache's answers, the residuals of indirect
+    light, and pixels covered."""
+
+    direct: mi.Color3f
+    cache: mi.Color3f
+    residual: mi.Color3f
+    covered: mi.Float
+
+
+class _FirstVertex:
+    """What is sampled at the first surface that is not a mirror.
+
+    path      the path that stands there
+    α         coefficient of the control variate
+    queried   where the cache is queried; `helps` says whether its terms do anything
+    """
+
+    def __init__(self, integrator, field, path, alpha, helps, n_cache):
+        self.integrator, self.field, self.path = integrator, field, path
+        self.bsdf = path.si.bsdf(path.ray)
+        self.here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
+        self.α, self.features, self.queried = mi.Float(0), None, mi.Bool(False)
+        if integrator.choice.may_ask and field is not None:
+            queried = vertex.is_smooth(path.si, path.active) & helps
+            self.α = integrator.coefficient(field, path.si, alpha, queried)
+            self.queried = queried & ((self.α > 0) | (mi.Bool(integrator.ris) & (n_cache > 1)))
+            self.features = field.encode(path.si.p, vertex.facing(path.si), self.queried)
+
+    def candidate(self, lobe, direction) -> tuple:
+        """(BSDF sample, its weight, whether it is of a mirror, what the cache answers times the weight)."""
+        si = self.path.si
+        bs, weight, delta = paths.sample_bsdf(si, self.bsdf, lobe, direction, self.path.active)
+        cached = mi.Color3f(0)
+        if self.features is not None:
+            queries = self.queried & ~delta & (bs.pdf <= SHARP_PDF)
+            cached = dr.select(queries, weight * self.field.query(self.features, si.to_world(bs.wo), queries), 0)
+        return bs, weight, delta, vertex.finite(cached, self.path.active)
+
+    def traced_sample(self, scene, lights, i, n, probability, sums: Sums, sampler, beyond, kept=None) -> tuple:
+        """`sums` after one more direction: direct light, and indirect light traced with `probability`."""
+        it, numbers = self.integrator, paths.stratified(sampler, n, i)
+        bs, weight, delta, cached = self.candidate(numbers.lobe, numbers.direction) if kept is None else kept
+        found, sampler = paths.bounce(
+            scene, lights, self.here, sampler, numbers, bsdf=self.bsdf, sampled=(bs, weight, delta)
+        )
+        q = dr.select(delta | (bs.pdf > SHARP_PDF), 1, probability)
+        keep = self.path.active & (sampler.together_1d(KEPT) < q)
+        after = replace(paths.advance(self.here, found, it.depth_limit), L=mi.Color3f(0))
+        after.active &= keep
+        after, sampler = beyond(after, sampler, mi.UInt32(i) * 64 + TOGETHER)
+        return Sums(
+            sums.direct + found.direct, sums.cache + cached,
+            sums.residual + two_level.residual(after.L, cached, self.α, q, keep),
+            sums.covered + dr.select(after.valid, 1, 0),
+        ), sampler  # fmt: skip
+
+    def cache_samples_only(self, n, sampler):
+        """Sum of the cache's answers in `n` directions that are not traced."""
+
+        def sample(i, cache):
+            numbers = sampler.stratified_1d(EXTRA_LOBE, n, i), sampler.stratified_2d(EXTRA, n, i)
+            return i + 1, cache + self.candidate(*numbers)[3]
+
+        return dr.while_loop(
+            (mi.UInt32(0), mi.Color3f(0)), lambda i, _: self.queried & (i < n), sample, label="cache samples"
+        )[1]
+
+    def resampled(self, n, sampler) -> tuple:
+        """One of `n` directions, kept in proportion to what the cache says comes from there: (sum of its answers,
+        :meth:`candidate` with the RIS weight in it, sampler)."""
+        defensive = DEFENSIVE * (self.field.scale if self.field is not None else mi.Float(1))
+
+        def consider(i, cache, t_sum, t_kept, kept, sampler):
+            new = self.candidate(sampler.stratified_1d(EXTRA_LOBE, n, i), sampler.stratified_2d(EXTRA, n, i))
+            t = two_level.resampling_target(new[3], new[1], defensive)
+            t_sum += t
+            take = sampler.next_1d() * t_sum < t
+            kept = tuple(dr.select(take, a, b) for a, b in zip(new, kept, strict=True))
+            return i + 1, cache + new[3], t_sum, dr.select(take, t, t_kept), kept, sampler
+
+        none = dr.zeros(mi.BSDFSample3f), mi.Color3f(0), mi.Bool(False), mi.Color3f(0)
+        state = mi.UInt32(0), mi.Color3f(0), mi.Float(0), mi.Float(0), none, sampler
+        _, cache, t_sum, t, (bs, weight, delta, cached), sampler = dr.while_loop(
+            state, lambda i, *_: self.path.active & (i < n), consider, label="candidates"
+        )
+        w = two_level.resampling_weight(t_sum, mi.Float(n), t)
+        return cache, (bs, w * weight, delta, w * cached), sampler
 
 
 NIRCTwoLevelIntegrator.CHANNELS = {

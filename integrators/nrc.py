@@ -11,12 +11,12 @@ from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import RATE, OutgoingCache, OutgoingShape, OutgoingTraining
 from mi_neural.caches.pair import PairCache
-from mi_neural.integrators import automatic, prefix
+from mi_neural.integrators import automatic
 from mi_neural.integrators.automatic import AUTO
 from mi_neural.integrators.common import CacheIntegrator
 from mi_neural.integrators.keys import SHARED_KEYS
-from mi_neural.transport import vertex
-from mi_neural.transport.suffixes import surface_of
+from mi_neural.render import prefix, vertex
+from mi_neural.render.surface import scene_is_glossy, surface_of
 
 #: Where paths end
 TERMINATIONS = ("spread", "auto")
@@ -103,31 +103,31 @@ class NRCIntegrator(CacheIntegrator):
         """E[L] = path tracing up to the vertex where the spread exceeds that of the pixel, and the cache there."""
         if self.termination == "auto":
             return automatic.estimate(self, scene, lights, field, sampler, ray, settings[0], active)
-        cached = self.needs_cache and field is not None
+        cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
 
         def stop(si, spread, smooth, first, sampler):
             wide = smooth & spread.exceeds(self.spread_threshold)
             never = mi.Bool(False)
-            return mi.Float(0), *((wide, never) if self.content == "reflected" else (never, wide))
+            return mi.Float(0), *((wide, never) if self.content == "reflected" else (never, wide)), sampler
 
-        views = cached and bool({"cache", "density"} & set(self.channels))
-        path = prefix.trace(self, scene, lights, sampler, ray, active, stop if cached else None, views)
-
-        cache = mi.Color3f(0)
+        looks = cached and bool({"cache", "density"} & set(self.channels))
+        end, sampler = prefix.trace(
+            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, looks
+        )
+        path, cache = end.path, mi.Color3f(0)
         if cached:
-            asks = path.ends | path.ends_lit
-            surface = surface_of(path.si, path.si.bsdf(path.ray), asks, path.glossy)
-            cache = dr.select(asks, path.β * field.query(*surface.inputs()), 0)
-        channels = {"traced": path.L, "cached": cache, "depth": dr.select(path.visible, mi.Float(path.depth), 0)}
+            surface = surface_of(path.si, path.si.bsdf(path.ray), end.queried, glossy)
+            cache = dr.select(end.queried, path.β * field.query(*surface.inputs()), 0)
+        channels = {"traced": path.L, "cached": cache, "depth": dr.select(path.valid, mi.Float(path.depth), 0)}
         shown = sigma_channels(field if cached else None, path.si.p, vertex.facing(path.si))
-        channels |= {k: dr.select(path.ends | path.ends_lit, v, 0) for k, v in shown.items()}
+        channels |= {k: dr.select(end.queried, v, 0) for k, v in shown.items()}
         channels |= {"share": mi.Float(0), "cache": mi.Color3f(0), "density": mi.Float(0)}
-        if views:
-            seen = dr.max(path.β_first) > 0
-            channels["cache"] = dr.select(seen, path.β_first * field.query(*path.first.inputs()), 0)
+        if looks:
+            seen = dr.max(end.β_first) > 0
+            channels["cache"] = dr.select(seen, end.β_first * field.query(*end.first.inputs()), 0)
             plain = field.field if isinstance(field, OutgoingBlend) else field
-            channels["density"] = dr.select(seen, plain.density_at(path.first.position), 0)
-        return path.L + cache, path.visible, channels
+            channels["density"] = dr.select(seen, plain.density_at(end.first.position), 0)
+        return path.L + cache, path.valid, channels
 
     # -------------------------------------------------------------------------------------------------------------
 

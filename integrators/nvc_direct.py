@@ -13,9 +13,10 @@ from mi_neural.lights import clusters
 from mi_neural.lights.sampling import VisibleLights
 from mi_neural.lights.table import LightTable
 from mi_neural.lights.unshadowed import UnshadowedLights
-from mi_neural.transport import vertex
-from mi_neural.transport.identity import SceneWatch
-from mi_neural.transport.samples import PathSampler
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+from mi_neural.render.binding import SceneWatch
+from mi_neural.render.sampling import PathSampler
 
 MODES = ("sampled", "neural")
 CACHES = ("visibility", "radiance")
@@ -162,7 +163,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         self.lights = None  # what chooses lights; None: the scene itself
         self.unshadowed: UnshadowedLights | None = None
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
-        self.mixed = self.mirrors = True  # whether materials have mirror lobes beside others, and nothing else
+        self.mixed = True  # whether materials have mirror lobes beside others
 
     def reseed(self, seed: int) -> None:
         self.cache.seed = seed
@@ -181,7 +182,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             check_scene(scene, self.plugin)
             if self.watch.parts is not None:
                 self.reset()
-            self.mixed, self.mirrors = delta_lobes(scene)
+            self.mixed = has_mixed_materials(scene)
             self.watch.changed(scene)
         with dr.resume_grad():
             self.lights = self.light_sampler.lights(scene, sensor, train)
@@ -232,23 +233,9 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True):
         if not self.entered and not self.watch.knows(scene):  # inside another integrator
             self.prepare_lights(scene, scene.sensors()[0])
-        ray, active = mi.Ray3f(dr.detach(ray)), mi.Bool(active) & (self.depth_limit > 0)
-
-        # What the camera sees
-        if self.hide:
-            pi = self.skip_area_emitters(scene, ray, True, active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            L, valid = mi.Color3f(0), active & si.is_valid()
-        else:
-            si = scene.ray_intersect(ray, active)
-            L = mi.Color3f(vertex.emission(scene, si, active))
-            valid = active & (si.is_valid() | (si.emitter(scene, active) != None))  # noqa: E711
-
-        L_seen, β, si, active, sampler = follow_mirrors(
-            scene, sampler, si, self.depth_limit, self.mirrors, active & si.is_valid()
-        )
-        bsdf = si.bsdf()
-        L += L_seen
+        path = paths.camera_vertex(self, scene, mi.Ray3f(dr.detach(ray)), active)
+        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, RR_DEPTH)
+        si, bsdf, active = path.si, path.si.bsdf(), path.active
 
         # Direct light at the first surface that is not a mirror
         if self.kind == "radiance":
@@ -257,33 +244,24 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             direct = self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), active)
             direct += self.mirrored(scene, si, bsdf, sampler, active)
         else:
-            direct = self.sampled(scene, si, bsdf, sampler, active)
-        L += dr.select(active, β * direct, 0)
-        return L, valid, self.extra(si, bsdf, sampler, active) if self.channels else []
+            direct = self.sampled(scene, path, sampler)
+        L = path.L + dr.select(active, path.β * direct, 0)
+        return L, path.valid, self.extra(si, bsdf, sampler, active) if self.channels else []
 
-    def sampled(self, scene, si, bsdf, sampler, active):
+    def sampled(self, scene, path, sampler):
         """E = ∫ f Le cos dω, by `light_samples` pairs of a shadow ray and a BSDF ray."""
         n = self.light_samples
 
         def pair(i, total, sampler):
-            # The BSDF's share
-            bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-            weight = vertex.finite(weight, active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            followed = active & (dr.max(weight) > 0)
-            si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
-
-            # The chosen light, and both weighted against each other
-            u = (mi.Float(i) + sampler.next_1d()) / n
-            L_nee, Le = vertex.emitted(
-                scene, self.lights, si, bsdf, u, sampler.next_2d(), sampler, active, si_next, bs.pdf, delta, followed,
-            )  # fmt: skip
-            return i + 1, total + L_nee + weight * Le, sampler
+            numbers, sampler = paths.draw_numbers(sampler)
+            numbers.light = (mi.Float(i) + numbers.light) / n
+            found, sampler = paths.bounce(scene, self.lights, path, sampler, numbers)
+            return i + 1, total + found.direct, sampler
 
         if n == 1:
             return pair(mi.UInt32(0), mi.Color3f(0), sampler)[1]
         _, total, _ = dr.while_loop(
-            (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, *_: active & (i < n), pair, label="shadow rays"
+            (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, *_: path.active & (i < n), pair, label="shadow rays"
         )
         return total / n
 
@@ -326,44 +304,13 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         )
 
 
-def delta_lobes(scene) -> tuple[bool, bool]:
-    """Whether materials of `scene` have mirror lobes beside others, and whether some have nothing else."""
+def has_mixed_materials(scene) -> bool:
+    """Whether materials of `scene` have mirror lobes beside others, as far as can be seen from here."""
     shapes = scene.shapes()
     if any(s.bsdf() is None or s.class_name() == "Instance" for s in shapes):
-        return True, True  # not all materials can be seen from here
+        return True
     flags = [s.bsdf().flags() for s in shapes]
-    smooth = [f for f in flags if mi.has_flag(f, mi.BSDFFlags.Smooth)]
-    return any(mi.has_flag(f, mi.BSDFFlags.Delta) for f in smooth), len(smooth) < len(flags)
-
-
-def follow_mirrors(scene, sampler, si, max_depth: int, mirrors: bool, active):
-    """Go on from `si` through surfaces without a smooth lobe, if there are such `mirrors`, to the first with one.
-
-    Returns (emission on the way, throughput, that surface, whether there is one within the depth, sampler).
-    """
-    β = dr.select(active, mi.Color3f(1), 0)
-    if not mirrors:
-        return mi.Color3f(0), β, si, active & (max_depth > 1), sampler
-    chain = active & ~vertex.has_smooth(si.bsdf())
-
-    def bounce(depth, si, β, L, chain, sampler):
-        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), chain)
-        β = dr.select(chain, β * weight, β)
-        roulette = chain & (depth >= RR_DEPTH)
-        q = dr.minimum(dr.max(β), 0.95)
-        goes_on = chain & (depth < max_depth) & (dr.max(β) > 0) & (~roulette | (sampler.next_1d() < q))
-        β = dr.select(roulette, β * dr.rcp(dr.maximum(q, 1e-6)), β)
-        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), goes_on)
-        L += dr.select(goes_on, β * vertex.emission(scene, si_next, goes_on), 0)
-        β = dr.select(chain & ~(goes_on & si_next.is_valid()), 0, β)
-        si = dr.select(goes_on, si_next, si)
-        return depth + 1, si, β, L, goes_on & si_next.is_valid() & ~vertex.has_smooth(si_next.bsdf()), sampler
-
-    depth, si, β, L, _, sampler = dr.while_loop(
-        (mi.UInt32(1), si, β, mi.Color3f(0), chain, sampler), lambda depth, si, β, L, chain, sampler: chain, bounce,
-        label="mirrors",
-    )  # fmt: skip
-    return L, β, si, active & (dr.max(β) > 0) & (depth < max_depth), sampler
+    return any(mi.has_flag(f, mi.BSDFFlags.Smooth) and mi.has_flag(f, mi.BSDFFlags.Delta) for f in flags)
 
 
 def direct_records(max_depth: int, scene, sensor, lights, n: int, seed):
@@ -371,20 +318,13 @@ def direct_records(max_depth: int, scene, sensor, lights, n: int, seed):
     lane = dr.arange(mi.UInt32, n)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
     ray, _ = sensor.sample_ray(sensor.shutter_open(), sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d())
-    si = scene.ray_intersect(ray)
-    _, _, si, active, sampler = follow_mirrors(scene, sampler, si, max_depth, delta_lobes(scene)[1], si.is_valid())
-    bsdf = si.bsdf()
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    weight = vertex.finite(weight, active & ~delta)  # mirror lobes are traced when the cache is read
-    followed = active & (dr.max(weight) > 0)
-    si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
-    L_nee, Le = vertex.emitted(
-        scene, lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active, si_next, bs.pdf, delta,
-        followed,
-    )  # fmt: skip
-    target = (L_nee + weight * Le) / albedo(si, bsdf, active)
-    valid = active & dr.all(dr.isfinite(target))
+    path = paths.start(ray, scene.ray_intersect(ray), mi.Bool(True), max_depth)
+    path, sampler = paths.follow_mirrors(scene, path, sampler, max_depth, RR_DEPTH)
+    # What mirror lobes show is traced when the cache is queried
+    found, sampler = paths.bounce(scene, lights, path, sampler, follow=lambda bs, delta: ~delta)
+    si = path.si
+    target = (found.L_nee + dr.select(found.delta, 0, found.weight) * found.Le) / albedo(si, si.bsdf(), path.active)
+    valid = path.active & dr.all(dr.isfinite(target))
     return mi.Point3f(si.p), mi.Color3f(dr.select(valid, target, 0)), valid
 
 

@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.transport import two_level
-from mi_neural.transport.freezing import undisturbed
+from mi_neural.estimators import two_level
+from mi_neural.render.frozen import undisturbed
 
 #: α by place, as a number among the settings.
 BY_PLACE = -1.0

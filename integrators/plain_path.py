@@ -1,11 +1,14 @@
 """``plain_path``: the shortest correct path tracer."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
 from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, LightSamplingIntegrator
 from mi_neural.lights.unshadowed import UnshadowedLights
-from mi_neural.transport import vertex
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
 
 
 class PlainPathIntegrator(LightSamplingIntegrator):
@@ -91,69 +94,31 @@ class PlainPathIntegrator(LightSamplingIntegrator):
             else:
                 self.unshadowed.refresh()
 
-    def direct(self, scene, sampler, si, bsdf, si_next, pdf_bsdf, delta, depth, active, followed):
-        """Both halves of direct light, as ``vertex.emitted``; deep down as predicted, and what mirrors show."""
-        predicted = active & (depth >= self.neural_depth) if self.unshadowed is not None else mi.Bool(False)
-        L, Le = vertex.emitted(
-            scene, self.lights, si, bsdf, sampler.next_1d(), sampler.next_2d(), sampler, active & ~predicted, si_next,
-            pdf_bsdf, delta, followed & (~predicted | delta),
-        )  # fmt: skip
-        if self.unshadowed is not None:
-            predicted &= vertex.has_smooth(bsdf)
-            L += self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), predicted)
-        return L, Le
+    def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
+        """As `paths.direct_light`; from `neural_depth` on as it is predicted, and what mirrors show."""
+        predicted = path.active & (path.depth > self.neural_depth)
+        traced = replace(path, active=path.active & ~predicted)
+        found = replace(found, followed=found.followed & (~predicted | found.delta))
+        L, Le, sampler = paths.direct_light(scene, lights, traced, bsdf, found, numbers, sampler)
+        predicted &= vertex.has_smooth(bsdf)
+        L += self.unshadowed.total(scene, path.si, bsdf, lights.field.query(path.si.p), predicted)
+        return L, Le, sampler
 
-    @dr.syntax
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        max_depth = mi.UInt32(self.max_depth if self.max_depth >= 0 else 0xFFFFFFFF)
-        bsdf_ctx = mi.BSDFContext()
         self.ready(scene)
+        limit = paths.depth_limit(self.max_depth)
+        direct = self.direct if self.unshadowed is not None else None
 
-        ray = mi.Ray3f(dr.detach(ray))
-        L = mi.Spectrum(0)  # Radiance so far
-        β = mi.Spectrum(1)  # Throughput
-        η = mi.Float(1)  # Relative index of refraction along the path
-        depth = mi.UInt32(0)
-        active = mi.Bool(active) & (max_depth > 0)
+        def step(path, sampler):
+            found, sampler = paths.bounce(scene, self.lights, path, sampler, direct=direct)
+            path = paths.advance(path, found, limit)
+            return paths.roulette(path, sampler, self.rr_depth)
 
-        # What the camera sees
-        if dr.hint(self.hide, mode="scalar"):
-            pi = self.skip_area_emitters(scene, ray, True, active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            valid = active & si.is_valid()
-        else:
-            si = scene.ray_intersect(ray, active)
-            L += vertex.emission(scene, si, active)
-            valid = active & (si.is_valid() | (si.emitter(scene, active) != None))  # noqa: E711
-        active &= si.is_valid() & (depth + 1 < max_depth)
-
-        while dr.hint(active, exclude=[self]):
-            # Go on in a direction that the BSDF chooses
-            bsdf = si.bsdf(ray)
-            bs, weight = bsdf.sample(bsdf_ctx, si, sampler.next_1d(), sampler.next_2d(), active)
-            weight = vertex.finite(weight, active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            ray = si.spawn_ray(si.to_world(bs.wo))
-            si_next = scene.ray_intersect(ray, active & (dr.max(weight) > 0))
-
-            # Direct light: by next-event estimation, and what that direction met
-            followed = active & (dr.max(weight) > 0)
-            L_nee, Le = self.direct(scene, sampler, si, bsdf, si_next, bs.pdf, delta, depth, active, followed)
-            L += β * (L_nee + weight * Le)
-
-            β *= weight
-            η *= bs.eta
-            depth += 1
-            active = followed & si_next.is_valid() & (depth + 1 < max_depth)
-
-            # Russian roulette (must cancel out η² to obtain unitless throughput)
-            q = dr.minimum(dr.max(β) * η**2, 0.95)
-            roulette = depth >= self.rr_depth
-            active &= (dr.max(β) > 0) & (~roulette | (sampler.next_1d() < q))
-            β[roulette] *= dr.rcp(dr.maximum(q, 1e-6))
-            si = si_next
-
-        return L, valid, []
+        path = paths.camera_vertex(self, scene, mi.Ray3f(dr.detach(ray)), active)
+        path, sampler = dr.while_loop(
+            (path, sampler), lambda path, sampler: path.active, step, label="path"
+        )
+        return path.L, path.valid, []
 
     def to_string(self):
         return f"PlainPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}]"

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.transport.correction import correction, scale_of, share_of_noise, trimmed_mean
+from mi_neural.estimators.combine import correction, scale_of, share_of_noise, trimmed_mean
 
 #: Channels that the parts of an image must have.
 BIASED, UNBIASED = ("cache", "residual"), ("cache", "residual", "variance_cache", "variance_residual",

@@ -7,14 +7,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural.estimators import reservoir
+from mi_neural.estimators.mis import mis_weight
+from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators.checks import check_film, check_scene, sensor_of
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
-from mi_neural.transport import reservoir, vertex
-from mi_neural.transport.freezing import can_freeze, undisturbed
-from mi_neural.transport.reservoir import Reservoir
-from mi_neural.transport.samples import PathSampler
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+from mi_neural.render.frozen import can_freeze, undisturbed
+from mi_neural.render.sampling import PathSampler
 
 COMBINATIONS = ("unbiased", "biased")
 CANDIDATES = ("light", "nvc")
@@ -152,7 +155,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.hide = props.get("hide_emitters", False)
+        self.hide, self.max_depth = props.get("hide_emitters", False), 2
         self.initial_candidates = props.get("initial_candidates", 8)
         self.history = props.get("history", 20.0)
         self.spatial_samples = props.get("spatial_samples", 4)
@@ -293,7 +296,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             )
 
             # ------------------- What the camera sees ---------------------
-            L, valid, si, usable = self.first_surface(scene, ray, sampler, power)
+            L, valid, si, usable, sampler = self.first_surface(scene, ray, sampler, power)
             w_camera = mi.Color3f(w_camera)
 
             # ------------- Where that was in the frame before -------------
@@ -333,31 +336,23 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def first_surface(self, scene, ray, sampler, power):
         """What the camera sees: emission, and that which a BSDF ray meets, weighted against light samples.
 
-        Returns (radiance so far, valid, surface, whether it takes light samples).
+        Returns (radiance so far, coverage, surface, whether it takes light samples, sampler).
         """
-        ray = mi.RayDifferential3f(ray)
-        if self.hide:
-            pi = self.skip_area_emitters(scene, mi.Ray3f(ray), True, mi.Bool(True))
-            si = pi.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, mi.Bool(True))
-            L, valid = mi.Color3f(0), si.is_valid()
-        else:
-            si = scene.ray_intersect(ray)
-            L = vertex.emission(scene, si, mi.Bool(True))
-            valid = si.is_valid() | (si.emitter(scene) != None)  # noqa: E711
-        active = si.is_valid()
-        bsdf = si.bsdf(ray)
-        bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-        weight = vertex.finite(weight, active)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        followed = active & (dr.max(weight) > 0)
-        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), followed)
-        table = power.table
-        hit, emits = table.index_of(scene, si_next, followed)
-        ds = mi.DirectionSample3f(scene, si_next, vertex.reference_point(si.p, si.n))
-        pdf_light = table.pdf(scene, si, hit, si_next, ds, emits & ~delta)
-        share = dr.select(delta, 1, 1 - self.light_share(power, hit, pdf_light, bs.pdf, emits))
-        L += dr.select(emits, weight * si_next.emitter(scene, emits).eval(si_next, emits) * share, 0)
-        return L, valid, _slim(si), active & vertex.has_smooth(bsdf)
+        path = paths.camera_vertex(self, scene, ray, mi.Bool(True))
+        found, sampler = paths.bounce(scene, power, path, sampler, direct=self.emission_met)
+        valid = paths.advance(path, found).valid
+        L = path.L + path.β * found.direct
+        return L, valid, _slim(path.si), vertex.is_smooth(path.si, path.active), sampler
+
+    def emission_met(self, scene, power, path, bsdf, found, numbers, sampler, alone=None):
+        """As `paths.direct_light`: no light sample, and the share of the BSDF ray in the emission that it met."""
+        table, si, delta = power.table, path.si, found.delta
+        hit, emits = table.index_of(scene, found.si, found.followed)
+        ds = mi.DirectionSample3f(scene, found.si, vertex.reference_point(si.p, si.n))
+        pdf_light = table.pdf(scene, si, hit, found.si, ds, emits & ~delta)
+        share = dr.select(delta, 1, 1 - self.light_share(power, hit, pdf_light, found.bs.pdf, emits))
+        Le = found.si.emitter(scene, emits).eval(found.si, emits)
+        return mi.Color3f(0), dr.select(emits, Le * share, 0), sampler
 
     def light_share(self, power, index, pdf, pdf_bsdf, active):
         """Share of light samples in what reaches a surface from a point on light `index`; the rest is the BSDF ray's.
@@ -366,7 +361,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         against one of the BSDF (Veach 1997, eq. 9.13).
         """
         pmf = power.pmf(None, None, None, index, active)
-        return vertex.mis_weight(self.initial_candidates * pmf * pdf, pdf_bsdf)
+        return mis_weight(self.initial_candidates * pmf * pdf, pdf_bsdf)
 
     def contribution(self, scene, power, si, index, uv, active):
         """What a light sample gives, shadows apart: (share times f Le cos over the density of `uv`, point on it)."""

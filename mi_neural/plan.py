@@ -21,8 +21,8 @@ from .caches.visibility import surface_point
 from .lights.clusters import make_groups
 from .lights.sampling import VISIBILITY_FLOOR, Columns, PowerLights
 from .lights.table import ENVIRONMENT, LOCAL, LightTable, importance
-from .transport.freezing import undisturbed
-from .transport.samples import PathSampler
+from .render.frozen import undisturbed
+from .render.sampling import PathSampler
 
 MODES = ("scene", "everything")
 #: Most outputs of the visibility network; more lights are known by clusters.

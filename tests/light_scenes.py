@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.lights.table import LightTable
-from mi_neural.transport.samples import PathSampler
+from mi_neural.render.sampling import PathSampler
 
 
 def at(*position):

@@ -225,24 +225,24 @@ def test_twins_start_together_and_their_records_are_right(sphere):
     incident = Field([-2] * 3, [2] * 3, FieldShape(n_levels=1, hashmap_size=64, width=4, n_hidden=1))
 
     def first(si, bsdf, active, sampler):
-        return dr.select(active, mi.Color3f(0.5), 0)
+        return dr.select(active, mi.Color3f(0.5), 0), sampler
 
-    records, _, bounces, said = training_paths(
+    traced = training_paths(
         sphere, sphere.sensors()[0], field, training, mi.UInt32(1), None, False, twins=True, first=first
     )
-    dr.eval(records, bounces, said)
-    x = np.array(records.surface.position)[:, : 2**13]
+    dr.eval(traced)
+    x = np.array(traced.outgoing.surface.position)[:, : 2**13]
     np.testing.assert_array_equal(x[:, ::2], x[:, 1::2])
-    valid = np.array(bounces.incident.valid)
+    valid = np.array(traced.incident.valid)
     assert valid.sum() > 2**13
-    assert_mean(np.array(bounces.incident.target)[0][valid], 1, "incident records", relative=1e-4)
-    p = pairs_of(records, bounces, said, field, training.n_paths)
+    assert_mean(np.array(traced.incident.target)[0][valid], 1, "incident records", relative=1e-4)
+    p = pairs_of(traced, field, training.n_paths)
     ok = np.array(p.valid)
     print(f"{ok.sum()} pairs")
     assert ok.mean() > 0.99
     for k in range(2):
         assert_mean(np.array(p.direct[k] + p.bounce[k])[0][ok], 1, "one more bounce", relative=1e-4)
-    n, w = (np.array(v)[:, : 2**13] for v in (records.surface.normal, bounces.incident.direction))
+    n, w = (np.array(v)[:, : 2**13] for v in (records.surface.normal, traced.incident.direction))
     tangent = w - (w * n).sum(axis=0) * n
     products = (tangent[:, ::2] * tangent[:, 1::2]).sum(axis=0)
     assert_mean(products, 0, "directions of the two, along the surface")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_neural.transport.correction import box_mean, correction, share_of_noise, smooth
+from mi_neural.estimators.combine import box_mean, correction, share_of_noise, smooth
 
 SHAPE = (48, 64, 3)
 

@@ -15,8 +15,8 @@ from expectation import assert_mean
 from mi_neural import scenes
 from mi_neural.caches.field import Field, FieldShape, Weights
 from mi_neural.caches.incident import IncidentCache, Training, reflect, trace_records
-from mi_neural.transport import vertex
-from mi_neural.transport.samples import PathSampler
+from mi_neural.render import vertex
+from mi_neural.render.sampling import PathSampler
 
 REFLECTED = {"lit_cube": 0.5, "point_lit_sphere": 1.0}
 SMALL = Training(n_paths=1024)
@@ -146,7 +146,7 @@ def test_reflected_cache_is_albedo_times_radiance(cube):
     field = constant_field(0.8)
     for n in (1, 3):
         sampler = PathSampler.make(dr.arange(mi.UInt32, 256), 1)
-        found = reflect(field, field.encode(si.p), si, si.bsdf(), n, sampler, mi.Bool(True))
+        found, _ = reflect(field, field.encode(si.p), si, si.bsdf(), n, sampler, mi.Bool(True))
         np.testing.assert_allclose(np.array(found), 0.4, rtol=1e-4)
 
 

@@ -153,8 +153,8 @@ def test_old_scenes_collected_while_a_pass_is_recorded_do_no_harm(run_python):
         import mi_neural, mitsuba as mi
         mi.set_variant("llvm_ad_rgb")
         from mi_neural import scenes
-        from mi_neural.transport import vertex
-        direct_light = vertex.direct_light
+        from mi_neural.render import path
+        direct_light = path.direct_light
         def collect_first(*args, **kw):  # the collector may run at any time, unless it is switched off
             if gc.isenabled():
                 gc.collect()
@@ -166,7 +166,7 @@ def test_old_scenes_collected_while_a_pass_is_recorded_do_no_harm(run_python):
         gc.set_threshold(10**6)
         old.append(old)  # a cycle: only the collector frees it
         del old
-        vertex.direct_light = collect_first
+        path.direct_light = collect_first
         integrator.render(scene, spp=1)
         assert gc.isenabled()
         print("done")

@@ -26,7 +26,7 @@ from mi_neural.lights import table as table_module
 from mi_neural.lights.clusters import make_groups
 from mi_neural.lights.sampling import PowerLights, UniformLights, VisibleLights
 from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, SHADOW_EPSILON, LightTable
-from mi_neural.transport import vertex
+from mi_neural.render import vertex
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from expectation import assert_same_mean, renders
 from hard_cases import Room, room
 
 from mi_neural.integrators import checks, common, lighting
-from mi_neural.transport.freezing import undisturbed
+from mi_neural.render.frozen import undisturbed
 
 SMALL = {"train_samples": 256, "train_frames": 8, "train_steps": 1, "levels": 4, "hashmap_size": 2**12}
 ALL = {
@@ -169,7 +169,7 @@ def interrupted_at(module, name: str, call: int):
 PLACES = {
     "records traced": ("mi_neural.caches.incident", "trace_records"),
     "records learned": ("mi_neural.caches.incident", "learn"),
-    "image traced": ("mi_neural.transport.vertex", "emitted"),
+    "image traced": ("mi_neural.render.path", "bounce"),
 }
 
 

@@ -31,7 +31,7 @@ from two_level_bench import (
 )
 
 from mi_neural.caches.field import CacheFileError, Field
-from mi_neural.transport import two_level as transport
+from mi_neural.estimators import two_level as transport
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,13 @@ from test_nirc import room
 from test_vertex import lights, test_scene
 
 from mi_neural import scenes
+from mi_neural.caches import training_paths
 from mi_neural.caches.field import CacheFileError, Field
 from mi_neural.caches.outgoing import OutgoingField, OutgoingShape, OutgoingTraining, Places, trace_outgoing
-from mi_neural.transport import suffixes
-from mi_neural.transport.samples import PathSampler
-from mi_neural.transport.termination import PathSpread, camera_spread
+from mi_neural.caches.records import empty_surfaces, packed
+from mi_neural.estimators.spread import PathSpread, camera_spread
+from mi_neural.render.sampling import PathSampler
+from mi_neural.render.surface import Roughened, surface_of
 
 SLOW = pytest.mark.slow  # more of what the default run shows at one value
 #: A cache that is trained in a second.
@@ -220,7 +222,7 @@ def targets(scene, sensor, field, **keys):
     return records, np.array(records.target), np.array(records.valid)
 
 
-@pytest.mark.parametrize("content", suffixes.CONTENTS)
+@pytest.mark.parametrize("content", training_paths.CONTENTS)
 @pytest.mark.parametrize("keys", [{}, {"suffix": "full", "n_vertices": 3}, {"unbounded_share": 1.0}], ids=str)
 def test_mean_target_with_the_right_cache_is_the_right_light(keys, content):
     """Self-training has the solution as its fixed point; so has a path that runs on, without a cache at all."""
@@ -249,7 +251,7 @@ def test_paths_that_leave_the_scene_are_not_self_trained():
         "type": "scene", "floor": {"type": "rectangle"}, "sky": {"type": "constant"},
         "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])},
     })  # fmt: skip
-    for content in suffixes.CONTENTS:
+    for content in training_paths.CONTENTS:
         _, target, valid = targets(scene, scene.sensors()[0], constant_field(100.0), content=content)
         assert valid.sum() > 100
         assert target[0][valid].mean() == pytest.approx({"reflected": 0.5, "indirect": 0.0}[content], rel=0.02)
@@ -268,12 +270,12 @@ def test_records_lie_on_surfaces_and_look_at_the_viewer(cube):
 
 
 def test_records_that_do_not_fit_are_left_out():
-    records = suffixes._empty(8)
+    records = empty_surfaces(8)
     records.target = mi.Color3f(dr.arange(mi.Float, 8))
     records.valid = mi.Bool([True, False, True, True, False, True, True, False])
-    out = suffixes.packed(records, 4)
+    out = packed(records, 4)
     assert np.array(out.target)[0].tolist() == [0, 2, 3, 5] and np.array(out.valid).all()
-    out = suffixes.packed(records, 6)
+    out = packed(records, 6)
     assert np.array(out.target)[0].tolist() == [0, 2, 3, 5, 6, 0] and np.array(out.valid).sum() == 5
 
 
@@ -295,7 +297,7 @@ def test_albedo_and_roughness_are_read_off_the_lobes(name):
     si = dr.zeros(mi.SurfaceInteraction3f, 1)
     si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
     si.wi = dr.normalize(mi.Vector3f(0.3, 0.1, 0.9))
-    s = suffixes.surface_of(si, bsdf, mi.Bool(True))
+    s = surface_of(si, bsdf, mi.Bool(True))
     found, rough = np.array(s.albedo).ravel(), float(s.roughness[0])
     print(f"{name}: albedo {found}, roughness {rough:.3f}")
     # What it is, by many samples
@@ -316,7 +318,7 @@ def test_roughened_surface_reflects_as_much_and_its_densities_are_right():
     si = dr.zeros(mi.SurfaceInteraction3f, n)
     si.wi = dr.normalize(mi.Vector3f(0.5, 0.1, 0.8)) + dr.zeros(mi.Vector3f, n)
     lambert = mi.Bool(rng.random(n) < 0.5)
-    rough = suffixes.Roughened(bsdf, lambert, mi.Color3f(0.8))
+    rough = Roughened(bsdf, lambert, mi.Color3f(0.8))
     u = rng.random((3, n))
     bs, weight = rough.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1:]), mi.Bool(True))
     f, pdf = rough.eval_pdf(mi.BSDFContext(), si, bs.wo, mi.Bool(True))

@@ -11,7 +11,7 @@ from outgoing_bench import close, jit, learn, make, same, surfaces, truth
 from mi_neural.caches import encoding
 from mi_neural.caches.field import own_copy
 from mi_neural.caches.outgoing import ALBEDO_MIN, OutgoingShape
-from mi_neural.transport.freezing import undisturbed
+from mi_neural.render.frozen import undisturbed
 
 # ---------------------------------------------------------------- the field: queries
 

@@ -17,9 +17,12 @@ from mi_neural.caches import reliability as rel
 from mi_neural.caches.field import attach_adam, descend
 from mi_neural.caches.incident import Training
 from mi_neural.caches.schedule import Ramp
+from mi_neural.estimators import reservoir
+from mi_neural.estimators import spread as termination
+from mi_neural.estimators.mis import mis_weight
+from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.lights import ltc
-from mi_neural.transport import reservoir, samples, termination, vertex
-from mi_neural.transport.reservoir import Reservoir
+from mi_neural.render import sampling
 
 N = 48
 LARGEST = float(np.finfo(np.float32).max)
@@ -70,7 +73,7 @@ def unit(vectors) -> np.ndarray:
 @given(arrays(ANY, 2))
 def test_mis_weights_lie_in_the_unit_interval_for_any_densities(pdf):
     for a, b in ((pdf[0], pdf[1]), (pdf[1], pdf[0])):
-        w = double(vertex.mis_weight(f(a), f(b)))
+        w = double(mis_weight(f(a), f(b)))
         assert ((w >= 0) & (w <= 1)).all()
         assert (w[~(a > 0)] == 0).all()
 
@@ -80,7 +83,7 @@ def test_mis_weights_lie_in_the_unit_interval_for_any_densities(pdf):
 def test_mis_weights_share_all_light_and_are_the_power_heuristic(pdf):
     a, b = pdf.astype(np.float64)
     some = (a > 0) | (b > 0)
-    w_a, w_b = double(vertex.mis_weight(f(pdf[0]), f(pdf[1]))), double(vertex.mis_weight(f(pdf[1]), f(pdf[0])))
+    w_a, w_b = double(mis_weight(f(pdf[0]), f(pdf[1]))), double(mis_weight(f(pdf[1]), f(pdf[0])))
     np.testing.assert_allclose((w_a + w_b)[some], 1, rtol=1e-6)
     known = a**2 / np.where(some, a**2 + b**2, 1)
     np.testing.assert_allclose(w_a[some], known[some], rtol=1e-5, atol=1e-12)
@@ -189,7 +192,7 @@ def test_balanced_probability_is_one_and_falls_with_the_density(pdf, n):
 @EXAMPLES
 @given(hnp.arrays(np.uint32, (2, N)))
 def test_sobol_points_lie_in_the_half_open_square(v):
-    p = np.array(samples.sobol_2d(mi.UInt32(v[0]), mi.UInt32(v[1])))
+    p = np.array(sampling.sobol_2d(mi.UInt32(v[0]), mi.UInt32(v[1])))
     assert ((p >= 0) & (p < 1)).all()
 
 
@@ -198,7 +201,7 @@ def test_sobol_points_lie_in_the_half_open_square(v):
 def test_sixteen_sobol_points_are_stratified_in_every_way(seed, block):
     """A (0,2)-sequence: one point in each of 16 equal boxes of every shape."""
     index = dr.arange(mi.UInt32, 16) + dr.opaque(mi.UInt32, 16 * block)
-    x, y = np.array(samples.sobol_2d(index, dr.opaque(mi.UInt32, seed))).astype(np.float64)
+    x, y = np.array(sampling.sobol_2d(index, dr.opaque(mi.UInt32, seed))).astype(np.float64)
     for k in range(5):
         boxes = np.floor(x * 2**k) * 2 ** (4 - k) + np.floor(y * 2 ** (4 - k))
         assert len(np.unique(boxes)) == 16, f"{2**k} x {2 ** (4 - k)}"

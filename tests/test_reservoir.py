@@ -9,9 +9,9 @@ import pytest
 from expectation import assert_mean
 from scipy import stats
 
-from mi_neural.transport import reservoir
-from mi_neural.transport.reservoir import Reservoir
-from mi_neural.transport.samples import PathSampler
+from mi_neural.estimators import reservoir
+from mi_neural.estimators.reservoir import Reservoir
+from mi_neural.render.sampling import PathSampler
 
 N = 2**17
 #: Targets of three pixels over eight lights, with holes; what is integrated; how candidates are drawn

@@ -10,7 +10,7 @@ import pytest
 from expectation import ERROR_RATE
 from scipy import stats
 
-from mi_neural.transport.samples import PathSampler, sobol_2d
+from mi_neural.render.sampling import PathSampler, sobol_2d
 
 N = 2**16
 

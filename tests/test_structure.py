@@ -21,8 +21,8 @@ FOLDERS = {"mi_neural.integrators": "integrators", "mi_neural.emitters": "emitte
 
 # Imports go from higher to lower layers; rooms on one layer do not know one another.
 LAYERS = [
-    {"llvm", "scenes"},
-    {"transport"},
+    {"llvm", "scenes", "estimators"},
+    {"render"},
     {"caches", "lights"},
     {"plan"},
     {"emitters"},  # light samplers do not know integrators
@@ -37,7 +37,8 @@ LAYERS = [
 STARTUP = {"", "registration"}
 
 # What must stay a function of samples or of features, whatever the scene
-BLIND = ["caches/field.py", "caches/encoding.py", "caches/loss.py", "transport/two_level.py", "transport/reservoir.py"]
+BLIND = ["caches/field.py", "caches/encoding.py", "caches/loss.py", "estimators/two_level.py",
+         "estimators/reservoir.py"]  # fmt: skip
 
 
 def sources() -> dict[str, Path]:

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_neural.transport import termination
+from mi_neural.estimators import spread as termination
 
 
 def test_camera_spread_is_that_of_the_paper(rng):

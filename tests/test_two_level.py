@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from expectation import assert_mean
 
-from mi_neural.transport import two_level
-from mi_neural.transport.samples import PathSampler
+from mi_neural.estimators import two_level
+from mi_neural.render.sampling import PathSampler
 
 N = 2**17
 #: ∫ (0.2 + 3 ω²) dω; scale of the caches

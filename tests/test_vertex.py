@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from expectation import assert_same_mean, renders
 
-from mi_neural.transport import vertex
+from mi_neural.estimators.mis import mis_weight
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+from mi_neural.render.sampling import PathSampler
 
 LIGHTS = {
     "area": {
@@ -61,20 +64,15 @@ class OneVertex(mi.SamplingIntegrator):
         super().__init__(props)
         self.alone = props.get("alone", False)
 
+    hide, max_depth = False, 2
+
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        si = scene.ray_intersect(ray, active)
-        L = vertex.emission(scene, si, active)
-        active = active & si.is_valid()
-        bsdf = si.bsdf(ray)
-        smooth = active & vertex.has_smooth(bsdf)
-        L += vertex.direct_light(scene, si, bsdf, sampler.next_2d(), smooth, alone=self.alone)
-        bs, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        path = paths.camera_vertex(self, scene, ray, active)
+        keys = {}
         if self.alone:
-            active &= delta
-        si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active)
-        L += weight * vertex.emission_mis(scene, si_next, si.p, si.n, bs.pdf, delta, active)
-        return L, mi.Bool(True), []
+            keys = {"alone": lambda pdf: mi.Bool(True), "follow": lambda bs, delta: delta}
+        found, _ = paths.bounce(scene, None, path, sampler, **keys)
+        return path.L + found.direct, mi.Bool(True), []
 
     def to_string(self):
         return "OneVertex[]"
@@ -87,21 +85,21 @@ def _registered():
 
 def test_mis_weights_sum_to_one(rng):
     a, b = (mi.Float((10.0 ** rng.uniform(-6, 6, 256)).astype("f4")) for _ in range(2))
-    found = np.array(vertex.mis_weight(a, b) + vertex.mis_weight(b, a))
+    found = np.array(mis_weight(a, b) + mis_weight(b, a))
     np.testing.assert_allclose(found, 1, rtol=1e-6)
     x, y = np.array(a), np.array(b)
-    np.testing.assert_allclose(np.array(vertex.mis_weight(a, b)), x**2 / (x**2 + y**2), rtol=1e-5)
+    np.testing.assert_allclose(np.array(mis_weight(a, b)), x**2 / (x**2 + y**2), rtol=1e-5)
 
 
 def test_mis_weight_of_what_cannot_be_sampled_is_zero_and_never_nan():
-    found = np.array(vertex.mis_weight(mi.Float(0, 0, 1, 1e-30), mi.Float(0, 1, 0, 1e-30)))
+    found = np.array(mis_weight(mi.Float(0, 0, 1, 1e-30), mi.Float(0, 1, 0, 1e-30)))
     assert np.isfinite(found).all() and (found[:3] == [0, 0, 1]).all() and 0 <= found[3] <= 1
 
 
 @pytest.mark.parametrize("pdf", [1e10, 1e18, 1e20, 1e30])
 def test_mis_weight_of_a_very_large_density_is_one_and_of_its_rival_zero(pdf):
-    assert vertex.mis_weight(mi.Float(pdf), mi.Float(1))[0] == 1
-    assert vertex.mis_weight(mi.Float(1), mi.Float(pdf))[0] <= 1e-19
+    assert mis_weight(mi.Float(pdf), mi.Float(1))[0] == 1
+    assert mis_weight(mi.Float(1), mi.Float(pdf))[0] <= 1e-19
 
 
 def test_only_finite_values_pass():
@@ -141,5 +139,6 @@ def test_inactive_lanes_give_nothing():
     si = scene.ray_intersect(ray)
     off = mi.Bool(False)
     assert (np.array(vertex.emission(scene, si, off)) == 0).all()
-    assert (np.array(vertex.direct_light(scene, si, si.bsdf(), mi.Point2f(0.3, 0.7), off)) == 0).all()
-    assert (np.array(vertex.emission_mis(scene, si, ray.o, mi.Normal3f(0, 1, 0), mi.Float(1), off, off)) == 0).all()
+    found, _ = paths.bounce(scene, None, paths.start(ray, si, off), PathSampler.make(dr.arange(mi.UInt32, 4), 0))
+    for value in (found.L_nee, found.weight, found.Le):
+        assert (np.array(value) == 0).all()

@@ -6,7 +6,7 @@ variance is that of regression,
     α = Cov(y, f) / Var(f),
 
 y being the traced radiance and f the cache's answer for the same direction. Records belong to earlier frames than the
-samples that α weighs, so that it is a constant to them (:mod:`mi_neural.transport.two_level`).
+samples that α weighs, so that it is a constant to them (:mod:`mi_neural.estimators.two_level`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport import two_level
-from ..transport.freezing import undisturbed
+from ..estimators import two_level
+from ..render.frozen import undisturbed
 from .blend import where_active
 from .field import Field
 from .incident import IncidentCache, trace_records
@@ -33,7 +33,7 @@ class ControlVariate:
     """A field, and α by place. A PyTree, with the queries of a :class:`~mi_neural.caches.field.Field` and the protocol
     of a :class:`~mi_neural.caches.blend.Blend`: training hands it the records that it learns from.
 
-    Answers are cut as :func:`~mi_neural.transport.two_level.sane` says.
+    Answers are cut as :func:`~mi_neural.estimators.two_level.sane` says.
     """
 
     DRJIT_STRUCT = {"field": object, "grid": object, "alpha": object}  # noqa: RUF012

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.freezing import can_freeze, undisturbed
+from ..render.frozen import can_freeze, undisturbed
 from . import encoding, loss
 from .field import Field, FieldShape
 from .schedule import Ramp

@@ -17,15 +17,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport import vertex
-from ..transport.freezing import can_freeze, undisturbed
-from ..transport.records import TrainingRecords, trace_training_paths
-from ..transport.samples import PathSampler
+from ..render import path as paths
+from ..render import vertex
+from ..render.frozen import can_freeze, undisturbed
+from ..render.sampling import PathSampler
 from . import encoding, loss
 from .blend import Blend
 from .divergence import StepWatch, healthy
 from .field import Field, FieldShape
+from .records import TrainingRecords
 from .reliability import Reliability
+from .training_paths import Suffixes, trace_training_paths
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
 TARGET_MAX = 1e4
@@ -78,37 +80,38 @@ class Training:
 
 
 def trace_records(scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None):
-    """Fresh training records, targets ending in the cache as it is asked (in nothing without one); `lights` as in
-    ``vertex.emitted``."""
+    """Fresh training records, and how many were left out because they were not finite.
+
+    Targets end in the cache as it is queried (in nothing without one); `lights` as in ``render.path.bounce``."""
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
     def from_cache(si, bsdf, active, sampler):
         return reflect(field, field.encode(si.p, vertex.facing(si)), si, bsdf, training.n_tail, sampler, active)
 
-    tail = from_cache if field is not None else (lambda si, bsdf, active, sampler: mi.Color3f(0))
-    return trace_training_paths(scene, sensor, sampler, training.n_paths, training.n_vertices, tail, lights)
+    plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False)
+    query = from_cache if field is not None else None
+    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights)
+    return traced.incident, traced.n_bad[1]
 
 
 def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
     """``1/n sum_i L(x, ω_i) f cos / p(ω_i)``: what a surface reflects of the cache, by `n` BSDF samples.
 
-    Delta lobes are left out.
+    Delta lobes are left out. Returns (that, sampler).
     """
-    ctx = mi.BSDFContext()
 
     def add(i, total, sampler):
-        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
-        rough = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        total += dr.select(rough, weight * field.query(features, si.to_world(bs.wo)), 0)
+        bs, weight, delta = paths.sample_bsdf(si, bsdf, sampler.next_1d(), sampler.next_2d(), active)
+        total += dr.select(active & ~delta, weight * field.query(features, si.to_world(bs.wo)), 0)
         return i + 1, total, sampler
 
     if n == 1:
-        return add(0, mi.Color3f(0), sampler)[1]
-    _, total, _ = dr.while_loop(
+        return add(0, mi.Color3f(0), sampler)[1:]
+    _, total, sampler = dr.while_loop(
         (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, total, sampler: active & (i < n), add, label="cache samples"
     )
-    return total * (1 / n)
+    return total * (1 / n), sampler
 
 
 def local_mean(field: Field, features: list, records: TrainingRecords, n: int, sampler):

@@ -17,14 +17,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.freezing import undisturbed
-from ..transport.samples import PathSampler
-from ..transport.suffixes import CONTENTS, Suffixes, packed, scene_is_glossy, trace_suffixes
+from ..render.frozen import undisturbed
+from ..render.sampling import PathSampler
+from ..render.surface import scene_is_glossy, surface_of
 from . import encoding, loss
 from .blend import OutgoingBlend
 from .field import FieldShape, TrainedField, Weights, descend
 from .incident import SCALE_TRIM, IncidentCache, Training
+from .records import packed
 from .reliability import Reliability
+from .training_paths import CONTENTS, Suffixes, trace_training_paths
 
 #: Reflectances below this count as this, so that no target is divided by 0 and black surfaces have an answer.
 ALBEDO_MIN = 0.05
@@ -343,7 +345,7 @@ class OutgoingTraining(Training):
                       300 steps in a stairwell: 0.070 with 0.01, 0.069 with 0.1, 0.066 with 1
     n_records         places for records in a step; more are left out
     suffix, threshold, world_share, roughening, content
-                      see :class:`~mi_neural.transport.suffixes.Suffixes`
+                      see :class:`~mi_neural.caches.training_paths.Suffixes`
     unbounded_share   share of the paths that run on without self-training (Müller et al. 2021: 1/16). In a room lit
                       through a door ajar the image had 0.96 and 0.97 of its light after 100 and 300 steps with 1/16,
                       0.99 and 1.00 with 1/4; in a stairwell 1.00 with either. A step takes 1.1 to 1.2 times as long
@@ -398,17 +400,19 @@ def training_paths(
     twins: bool = False, first: Callable | None = None,
 ):  # fmt: skip
     """Fresh training paths, targets ending in the averaged cache (in nothing without a field); see
-    :func:`~mi_neural.transport.suffixes.trace_suffixes`."""
+    :func:`~mi_neural.caches.training_paths.trace_training_paths`."""
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
     plan = training.paths(field is None, twins)
     if field is None:
-        return trace_suffixes(scene, sensor, sampler, plan, None, lights, None, glossy)
+        return trace_training_paths(scene, sensor, sampler, plan, None, lights, None, glossy)
+
+    def query(si, bsdf, active, sampler):
+        return field.query(*surface_of(si, bsdf, active, glossy).inputs()), sampler
+
     # Close before the place, where hardly anything can lie between
     places = field.places.position, field.places.view, 1e-3 * dr.norm(1 / field.box_inv_extent)
-    return trace_suffixes(
-        scene, sensor, sampler, plan, lambda surface: field.query(*surface.inputs()), lights, places, glossy, first
-    )
+    return trace_training_paths(scene, sensor, sampler, plan, query, lights, places, glossy, first)
 
 
 def fitted(records, training: OutgoingTraining):
@@ -418,7 +422,8 @@ def fitted(records, training: OutgoingTraining):
 
 def trace_outgoing(scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool):
     """Fresh training records, and how many were left out because their targets were not finite."""
-    records, n_bad, _, _ = training_paths(scene, sensor, field, training, seed, lights, glossy)
+    traced = training_paths(scene, sensor, field, training, seed, lights, glossy)
+    records, n_bad = traced.outgoing, traced.n_bad[0]
     if field is not None:
         dr.eval(records, n_bad)
         records = fitted(records, training)

@@ -10,12 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport import vertex
-from ..transport.suffixes import scene_is_glossy
+from ..render import vertex
+from ..render.surface import scene_is_glossy
 from .accuracy import Accuracy, Pairs
 from .field import Field, FieldShape, TrainedField
 from .incident import Training, learn, reflect
 from .outgoing import OutgoingCache, OutgoingField, OutgoingShape, OutgoingTraining, fitted, training_paths
+from .training_paths import PathRecords
 
 
 class PairField(TrainedField):
@@ -147,18 +148,18 @@ class PairCache(OutgoingCache):
             return reflect(incident, features, si, bsdf, self.n_queries, sampler, active)
 
         with dr.suspend_grad():
-            records, n_bad, bounces, said = training_paths(
+            traced = training_paths(
                 scene, sensor, outgoing, self.training, seed, lights, scene_is_glossy(scene), twins=True, first=ask
             )
-            n_valid = dr.count(records.valid)
-            dr.eval(records, n_bad, n_valid, bounces, said)
-            pairs = pairs_of(records, bounces, said, outgoing, self.training.n_paths)
-            arrived = fitted(bounces.incident, self.training)
-            records = fitted(records, self.training)
+            n_valid, n_bad = dr.count(traced.outgoing.valid), traced.n_bad[0]
+            dr.eval(traced, n_valid)
+            pairs = pairs_of(traced, outgoing, self.training.n_paths)
+            arrived = fitted(traced.incident, self.training)
+            records = fitted(traced.outgoing, self.training)
             self.note(outgoing, records, seed, decay)
-            said = outgoing.query(*records.surface.inputs())
-            dr.eval(pairs, arrived, records, said)
-            field.accuracy.observe(pairs, records.surface.position, records.target, said, records.valid, decay)
+            prediction = outgoing.query(*records.surface.inputs())
+            dr.eval(pairs, arrived, records, prediction)
+            field.accuracy.observe(pairs, records.surface.position, records.target, prediction, records.valid, decay)
         value, mean_target, mean_prediction, more = outgoing.learn(
             *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon
         )
@@ -171,26 +172,26 @@ class PairCache(OutgoingCache):
         return value, dr.maximum(mean_target, mean_target_i), mean_prediction, n_valid, n_bad + more, mi.Float(0)
 
 
-def pairs_of(records, bounces, said, outgoing: OutgoingField, n_paths: int) -> Pairs:
+def pairs_of(traced: PathRecords, outgoing: OutgoingField, n_paths: int) -> Pairs:
     """The first vertices of twin paths: both estimates of each, by one more bounce and by the incident cache.
 
     One more bounce is what a pixel's path does: it ends at the second vertex in the outgoing cache, if it may end
     there; else it goes on, as the training path did.
     """
-    lane = dr.arange(mi.UInt32, n_paths)
+    records, lane = traced.outgoing, dr.arange(mi.UInt32, n_paths)
     n_records = dr.width(records.valid)
     second = dr.minimum(lane + n_paths, n_records - 1)
-    ends = dr.gather(mi.Bool, bounces.stops, lane) & dr.gather(mi.Bool, records.valid, second)
+    ends = dr.gather(mi.Bool, traced.stops, lane) & dr.gather(mi.Bool, records.valid, second)
     ends &= lane + n_paths < n_records
     surface = dr.gather(type(records.surface), records.surface, second)
-    beyond = dr.select(ends, outgoing.query(*surface.inputs()), dr.gather(mi.Color3f, bounces.incident.target, lane))
-    bounce = dr.gather(mi.Color3f, bounces.weight, lane) * beyond
-    direct = dr.gather(mi.Color3f, bounces.direct, lane)
+    beyond = dr.select(ends, outgoing.query(*surface.inputs()), dr.gather(mi.Color3f, traced.incident.target, lane))
+    bounce = dr.gather(mi.Color3f, traced.weight, lane) * beyond
+    direct = dr.gather(mi.Color3f, traced.direct, lane)
     dr.eval(bounce, direct)
 
     k = dr.arange(mi.UInt32, n_paths // 2) * 2
     surface = dr.gather(type(records.surface), records.surface, k)
-    twins = [(dr.gather(mi.Color3f, v, k), dr.gather(mi.Color3f, v, k + 1)) for v in (direct, bounce, said)]
+    twins = [(dr.gather(mi.Color3f, v, k), dr.gather(mi.Color3f, v, k + 1)) for v in (direct, bounce, traced.first)]
     valid = dr.gather(mi.Bool, records.valid, k) & dr.gather(mi.Bool, records.valid, k + 1)
     for v in twins:
         valid &= dr.all(dr.isfinite(v[0] + v[1]))

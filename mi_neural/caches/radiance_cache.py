@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.freezing import undisturbed
+from ..render.frozen import undisturbed
 from .field import CacheFileError, own_copy
 from .outgoing import OutgoingField, OutgoingShape, check_box
 

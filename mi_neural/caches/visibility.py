@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport.freezing import undisturbed
-from ..transport.samples import PathSampler
+from ..render.frozen import undisturbed
+from ..render.sampling import PathSampler
 from . import encoding
 from .divergence import StepWatch, healthy
 from .field import FieldShape, Weights, attach_adam, descend, own_copy

@@ -12,9 +12,9 @@ import numpy as np
 
 from mi_neural.caches.blend import Blend
 from mi_neural.caches.outgoing import OutgoingField
-from mi_neural.transport import vertex
-from mi_neural.transport.samples import PathSampler
-from mi_neural.transport.suffixes import scene_is_glossy, surface_of
+from mi_neural.render import vertex
+from mi_neural.render.sampling import PathSampler
+from mi_neural.render.surface import scene_is_glossy, surface_of
 
 
 class Unavailable(ValueError):

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..transport import vertex
+from ..render import vertex
 from .sky import REACH, Sky
 
 #: More entries than this are refused: 100 bytes each, besides what building them takes.

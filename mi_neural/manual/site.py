@@ -18,7 +18,7 @@ from mi_neural.measure import exr
 MODULES = ("mi_neural", "mi_neural.explore.live", "mi_neural.explore.session", "mi_neural.explore.views",
            "mi_neural.caches.field", "mi_neural.caches.incident", "mi_neural.caches.outgoing",
            "mi_neural.caches.visibility", "mi_neural.caches.radiance_cache", "mi_neural.lights.sampling",
-           "mi_neural.lights.table", "mi_neural.transport.two_level", "mi_neural.transport.reservoir",
+           "mi_neural.lights.table", "mi_neural.estimators.two_level", "mi_neural.estimators.reservoir",
            "mi_neural.measure.metrics", "mi_neural.measure.exr", "mi_neural.measure.changes",
            "mi_neural.scenes")  # fmt: skip
 

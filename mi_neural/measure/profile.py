@@ -26,7 +26,7 @@ from statistics import median
 
 import numpy as np
 
-from mi_neural.transport.freezing import undisturbed
+from mi_neural.render.frozen import undisturbed
 
 from . import budget, environment, exr, load, memory, split
 

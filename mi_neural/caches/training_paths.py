@@ -1,0 +1,247 @@
+"""Training paths, which give records to caches of incident and of outgoing radiance (Müller et al. 2021, section 3.4).
+
+The radiance that a ray brings to one vertex is what the next vertex sends out, so one path has records for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..estimators.spread import PathSpread
+from ..render import path as paths
+from ..render import vertex
+from ..render.sampling import PathSampler
+from ..render.surface import Roughened, surface_of
+from .records import OutgoingRecords, TrainingRecords, empty_surfaces, leave_out_nonfinite
+
+#: Contents of a cache of outgoing radiance: all light that a surface reflects, or that without direct light.
+CONTENTS = ("reflected", "indirect")
+#: Mirrors that the end of a training path is followed through.
+MAX_CHAIN = 16
+#: Vertices after which a path without an end is given up, and bounces before roulette may end it.
+MAX_VERTICES, RR_DEPTH = 256, 5
+
+
+@dataclass(frozen=True)
+class Suffixes:
+    """How training paths run.
+
+    n_paths         paths
+    n_vertices      longest path whose vertices give records, but the last
+    suffix          where a path ends in the cache: ``spread``, at the second vertex where it has become wide
+                    (termination; the first one ends the path of a pixel), or ``full``, at vertex `n_vertices`
+    threshold       constant c of the spread test
+    n_unbounded     paths that do not end in the cache, but run on until roulette or nothingness ends them
+    world_share     share of the paths that start where earlier records lay, in place of the camera
+    roughening      at each further bounce this share of a surface's BSDF becomes Lambertian
+    content         see `CONTENTS`; what the cache holds that is queried at the ends
+    twins           whether the paths 2k and 2k + 1 start with the same ray
+    surfaces        whether records of outgoing radiance are wanted
+    """
+
+    n_paths: int
+    n_vertices: int
+    suffix: str = "full"
+    threshold: float = 0.01
+    n_unbounded: int = 0
+    world_share: float = 0.0
+    roughening: float = 0.0
+    content: str = "indirect"
+    twins: bool = False
+    surfaces: bool = True
+
+
+@dataclass
+class PathRecords:
+    """What training paths give, vertex by vertex: ``n_paths * (n_vertices - 1)`` entries.
+
+    outgoing   records of what the vertex sends out; only their positions and normals if no surfaces were asked for
+    incident   records of the radiance that the BSDF ray brought back, emission excluded; valid for rays of smooth lobes
+    direct     direct light that the vertex reflects towards its viewer, traced
+    weight     ``f cos/p`` of the BSDF ray that left it
+    stops      whether the vertex that the ray met is where a pixel's path would end in the cache
+    n_bad      how many outgoing and incident records were left out because their targets were not finite
+    first      answers of ``first`` at the first vertices, one for each path
+    """
+
+    outgoing: OutgoingRecords
+    incident: TrainingRecords
+    direct: mi.Color3f
+    weight: mi.Color3f
+    stops: mi.Bool
+    n_bad: tuple
+    first: mi.Color3f
+
+
+def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple | None):
+    """Rays from random points of the film; so many others to random `places` instead: positions and directions to
+    their viewers (world space; not finite where unknown), and how far before them to start."""
+    # Stratified over the film: paths are the samples of one pixel, the film
+    ray, _ = sensor.sample_ray(
+        sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time(),
+        sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d(),
+    )  # fmt: skip
+    ray = mi.Ray3f(ray)
+    if places is None or world_share <= 0:
+        return ray
+    # Every so many-th lane, evenly: multiples of the golden ratio
+    lane = dr.arange(mi.UInt32, n_paths)
+    world = mi.Float((lane * mi.UInt32(0x9E3779B9)) >> 8) * 2**-24 < world_share
+    position, view, distance = places
+    n_places = dr.width(position)
+    i = dr.minimum(mi.UInt32(sampler.next_1d() * n_places), n_places - 1)
+    p, w = dr.gather(mi.Point3f, position, i), dr.gather(mi.Vector3f, view, i)
+    world &= dr.all(dr.isfinite(p))
+    ray.o, ray.d = dr.select(world, p + distance * w, ray.o), dr.select(world, -w, ray.d)
+    return ray
+
+
+def _twin_rays(sensor, sampler, plan: Suffixes, places):
+    """As :func:`first_rays`; two paths start with each ray, so that two independent estimates of the same radiance
+    exist."""
+    n_rays = (plan.n_paths + 1) // 2
+    lane, seed = dr.arange(mi.UInt32, n_rays), dr.gather(mi.UInt32, sampler.scramble, 0)
+    numbers = PathSampler.make(lane, seed + 0x85EBCA6B, index=lane, scramble=seed)
+    rays = first_rays(sensor, numbers, n_rays, plan.world_share, places)
+    return dr.gather(mi.Ray3f, rays, dr.arange(mi.UInt32, plan.n_paths) // 2)
+
+
+def trace_training_paths(
+    scene, sensor, sampler, plan: Suffixes, query: Callable | None, lights=None, places: tuple | None = None,
+    glossy: bool = True, first: Callable | None = None,
+) -> PathRecords:  # fmt: skip
+    """Training paths; each terminal vertex (see ``vertex.is_terminal``), but the last, gives one record.
+
+    The radiance reflected at vertex k is
+
+        S_k = N_k + f_k (E_k + S_{k+1}),
+
+    N being next-event estimation, E the emission met by the BSDF ray (the two share the direct light by MIS) and f the
+    BSDF sample's weight. It is the target of outgoing records for the content ``reflected``; for ``indirect`` that is
+    ``f_k S_{k+1}``. The target of an incident record at vertex k is S_{k+1}. At the end of a path ``query(si, bsdf,
+    active, sampler)``, which returns (value, sampler), stands for what the cache holds of S (self-training; None:
+    nothing). Paths that left the scene, or that run on without an end, are not self-trained. ``first(si, bsdf, active,
+    sampler)``, with the same result, is called at the first vertices.
+    """
+    n_paths, n_kept = plan.n_paths, plan.n_vertices - 1
+    size = n_paths * n_kept
+    lane = dr.arange(mi.UInt32, n_paths)
+    unbounded = lane < plan.n_unbounded
+
+    records = empty_surfaces(size)
+    E, N, f = (dr.zeros(mi.Color3f, size) for _ in range(3))
+    direction, rough, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
+
+    def surface_at(path, active):
+        return surface_of(path.si, path.si.bsdf(path.ray), active, glossy)
+
+    def step(path, n_rough, sampler, albedo=None):
+        """One bounce, the surface roughened as the path has bounced before: (Bounce, sampler)."""
+        bsdf = path.si.bsdf(path.ray)
+        if plan.roughening > 0:
+            albedo = surface_of(path.si, bsdf, path.active, False).albedo if albedo is None else albedo
+            share = 1 - dr.power(mi.Float(1 - plan.roughening), n_rough)
+            opaque = vertex.has_smooth(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+            bsdf = Roughened(bsdf, path.active & opaque & (sampler.next_1d() < share), albedo)
+        return paths.bounce(scene, lights, path, sampler, bsdf=bsdf)
+
+    # ------------------------- Vertices with records --------------------------
+    def keep(k, path, found, terminal, surface):
+        i = k * n_paths + lane
+        dr.scatter(E, found.Le, i)
+        dr.scatter(N, found.L_nee, i)
+        dr.scatter(f, found.weight, i)
+        if surface is not None:
+            for to, value in zip(records.surface.inputs(), surface.inputs(), strict=True):
+                dr.scatter(to, value, i)
+        else:
+            dr.scatter(records.surface.position, path.si.p, i)
+            dr.scatter(records.surface.normal, vertex.facing(path.si), i)
+        dr.scatter(records.valid, terminal, i)
+        dr.scatter(direction, found.ray.d, i)
+        dr.scatter(rough, terminal & found.followed & ~found.delta, i)
+
+    def bounce(k, path, spread, ends, n_rough, open_, sampler):
+        terminal = vertex.is_terminal(path.si, path.active)
+        surface = surface_at(path, path.active) if plan.surfaces else None
+        found, sampler = step(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
+        keep(k, path, found, terminal, surface)
+        path = paths.advance(path, found)
+        open_ = mi.Bool(path.active)
+        if plan.surfaces:
+            terminal = vertex.is_terminal(path.si, open_)
+            spread = spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, terminal)
+            wide = terminal & spread.exceeds(plan.threshold)
+            dr.scatter(stops, wide, k * n_paths + lane)
+            if plan.suffix == "spread":
+                path.active &= ~(wide & (ends > 0)) | unbounded
+                ends += dr.select(wide, 1, 0)
+                spread = spread.restarted(wide)
+        return k + 1, path, spread, ends, n_rough + dr.select(found.delta, 0, 1), open_, sampler
+
+    if plan.twins:
+        ray = _twin_rays(sensor, sampler, plan, places)
+    else:
+        ray = first_rays(sensor, sampler, n_paths, plan.world_share, places)
+    si = scene.ray_intersect(ray)
+    path = paths.start(ray, si, mi.Bool(True))
+    terminal, answer = vertex.is_terminal(si, path.active), mi.Color3f(0)
+    if first is not None:
+        answer, sampler = first(si, si.bsdf(ray), terminal, sampler)
+    spread = PathSpread.start(n_paths).arrive(si, ray, mi.Float(1), mi.Bool(True), terminal)
+    state = (mi.UInt32(0), path, spread, mi.UInt32(0), mi.Float(0), mi.Bool(path.active), sampler)
+    k_end, path, _, _, n_rough, open_, sampler = dr.while_loop(
+        state, lambda k, path, spread, ends, n_rough, open_, sampler: path.active & (k < n_kept), bounce,
+        label="training paths",
+    )  # fmt: skip
+
+    # ------------- Their ends: seen through mirrors and glass, or run on ----------
+    def run_on(k, path, n_rough, queries, sampler):
+        found, sampler = step(path, n_rough, sampler)
+        path, sampler = paths.roulette(paths.advance(path, found), sampler, RR_DEPTH)
+        terminal = vertex.is_terminal(path.si, path.active)
+        queries |= terminal & ~unbounded
+        path.active &= (unbounded & (k < MAX_VERTICES)) | (~unbounded & ~terminal & (k < MAX_CHAIN))
+        return k + 1, path, n_rough + dr.select(found.delta, 0, 1), queries, sampler
+
+    terminal = vertex.is_terminal(path.si, open_)
+    path = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1), depth=mi.UInt32(1),
+                   active=open_ & (unbounded | ~terminal))  # fmt: skip
+    _, path, n_rough, queries, sampler = dr.while_loop(
+        (mi.UInt32(0), path, n_rough, terminal & ~unbounded, sampler),
+        lambda k, path, n_rough, queries, sampler: path.active, run_on, label="ends of training paths",
+    )  # fmt: skip
+    end, path = path.L, replace(path, active=queries)
+    if plan.content == "indirect":  # direct light at the end: it is in S, but not in the cache
+        found, sampler = step(path, n_rough, sampler)
+        end += dr.select(queries, path.β * found.direct, 0)
+    if query is not None:
+        value, sampler = query(path.si, path.si.bsdf(path.ray), queries, sampler)
+        end += dr.select(queries, path.β * value, 0)
+
+    # ------------------------------ Back to front -----------------------------
+    dr.eval(E, N, f, end, k_end, records, direction, rough, stops, answer)
+    arrived = dr.zeros(mi.Color3f, size)
+    S = mi.Color3f(0)
+    for k in reversed(range(n_kept)):
+        i = k * n_paths + lane
+        S = dr.select(k_end == k + 1, end, S)
+        dr.scatter(arrived, S, i)
+        weight = dr.gather(mi.Color3f, f, i)
+        direct = dr.gather(mi.Color3f, N, i) + weight * dr.gather(mi.Color3f, E, i)
+        reflected = weight * S
+        S = direct + reflected
+        if plan.surfaces:
+            dr.scatter(records.target, reflected if plan.content == "indirect" else S, i)
+
+    finite = dr.all(dr.isfinite(records.target))
+    n_bad = dr.count(records.valid & ~finite)
+    records.valid &= finite
+    records.target = dr.select(records.valid, records.target, 0)
+    incident = TrainingRecords(records.surface.position, direction, records.surface.normal, arrived, rough)
+    n_bad = n_bad, leave_out_nonfinite(incident)
+    return PathRecords(records, incident, N + f * E, f, stops, n_bad, answer)

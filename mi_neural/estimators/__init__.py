@@ -1,0 +1,1 @@
+"""Pure functions of samples: no module here knows a scene or a sampler."""

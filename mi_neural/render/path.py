@@ -1,0 +1,286 @@
+"""A path and one bounce of it: the light transport loop of all integrators and of all training paths.
+
+A path is a :class:`PathState`. :func:`camera_vertex` begins one, :func:`bounce` samples the BSDF where it stands,
+traces that ray and finds direct light, :func:`advance` moves it to what the ray met, :func:`roulette` may end it:
+
+    path = camera_vertex(integrator, scene, ray, active)
+    while path.active:
+        found, sampler = bounce(scene, lights, path, sampler)
+        path = advance(path, found, max_depth)
+        path, sampler = roulette(path, sampler, rr_depth)
+
+is a path tracer; E[path.L] is the radiance along the camera ray. The behaviour of Mitsuba's ``path`` is the reference
+for `valid` (alpha), null surfaces, ``hide_emitters``, ``rr_depth`` and ``max_depth``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..estimators.mis import mis_weight
+from . import vertex
+
+#: `max_depth` of a path without a limit.
+NO_LIMIT = 0x7FFFFFFF
+#: Dimensions of the stratified numbers of a camera sample, see :func:`stratified`; 0 is the place on the film, those
+#: from `FREE` on are the integrator's.
+POINT, DIRECTION, LOBE, LIGHT, FREE = range(1, 6)
+
+
+@dataclass
+class PathState:
+    """A path at one of its vertices. A PyTree: it may be a loop variable.
+
+    L        radiance found so far, at the start of the path
+    β        throughput from the start to here
+    η        relative index of refraction along the path
+    depth    segments traced, the one that led here included
+    ray, si  that segment, and what it met
+    valid    whether the pixel is covered: what Mitsuba's film takes as alpha
+    active   whether the path goes on: there is a surface, and another segment is allowed
+    """
+
+    L: mi.Spectrum
+    β: mi.Spectrum
+    η: mi.Float
+    depth: mi.UInt32
+    ray: mi.Ray3f
+    si: mi.SurfaceInteraction3f
+    valid: mi.Bool
+    active: mi.Bool
+
+
+@dataclass
+class Numbers:
+    """Uniform random numbers of one bounce: the BSDF's lobe and direction, the light, and the point on it."""
+
+    lobe: mi.Float
+    direction: mi.Point2f
+    light: mi.Float
+    point: mi.Point2f
+
+
+@dataclass
+class Bounce:
+    """One BSDF sample, what its ray met, and direct light where it started.
+
+    bs        BSDF sample
+    weight    ``f cos / p``
+    delta     whether a mirror lobe was sampled
+    ray, si   the ray and what it met
+    followed  whether it was traced
+    L_nee     next-event estimation at the vertex
+    Le        emission that the ray met; both carry their MIS weights
+    """
+
+    bs: mi.BSDFSample3f
+    weight: mi.Spectrum
+    delta: mi.Bool
+    ray: mi.Ray3f
+    si: mi.SurfaceInteraction3f
+    followed: mi.Bool
+    L_nee: mi.Spectrum
+    Le: mi.Spectrum
+
+    @property
+    def direct(self):
+        """Direct light at the vertex: E[direct] = ∫ f Le cos dω."""
+        return self.L_nee + self.weight * self.Le
+
+
+def depth_limit(max_depth: int) -> int:
+    """Mitsuba's ``max_depth``, -1 being no limit, as a number to compare depths with."""
+    return max_depth if max_depth >= 0 else NO_LIMIT
+
+
+def start(ray, si, active, max_depth: int = NO_LIMIT) -> PathState:
+    """A path that begins with `ray`, which met `si`, and has found nothing yet."""
+    active = mi.Bool(active) & si.is_valid()
+    valid = active & ~vertex.has_null(si.bsdf())
+    return PathState(
+        mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), mi.UInt32(1), mi.Ray3f(ray), si, valid, active & (max_depth > 1)
+    )
+
+
+def camera_vertex(integrator, scene, ray, active) -> PathState:
+    """A path at what a camera ray meets, with the emission that the camera sees there.
+
+    `integrator` gives ``max_depth`` and ``hide_emitters`` (its attribute `hide`).
+    """
+    limit = depth_limit(integrator.max_depth)
+    active = mi.Bool(active) & (limit > 0)
+    if integrator.hide:
+        pi = integrator.skip_area_emitters(scene, mi.Ray3f(ray), True, active)
+        si = pi.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, active)
+    else:
+        si = scene.ray_intersect(ray, active)
+    path = start(ray, si, active, limit)
+    if integrator.hide:
+        path.L = path.L + vertex.emission(scene, si, active & si.is_valid())
+    else:
+        path.L = path.L + vertex.emission(scene, si, active)
+        path.valid = path.valid | (active & (scene.environment() is not None))
+    return path
+
+
+def draw_numbers(sampler) -> tuple:
+    """(independent numbers of one bounce, sampler)."""
+    lobe, direction, light, point = sampler.next_1d(), sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
+    return Numbers(lobe, mi.Point2f(direction), light, mi.Point2f(point)), sampler
+
+
+def stratified(sampler, n=1, i=0) -> Numbers:
+    """Numbers of bounce `i` of `n` that spread evenly over the samples of a pixel."""
+    return Numbers(
+        sampler.stratified_1d(LOBE, n, i), sampler.stratified_2d(DIRECTION, n, i), sampler.stratified_1d(LIGHT, n, i),
+        sampler.stratified_2d(POINT, n, i),
+    )  # fmt: skip
+
+
+def sample_bsdf(si, bsdf, lobe, direction, active) -> tuple:
+    """A direction by a BSDF, from uniform numbers: (BSDF sample, ``f cos / p``, whether a mirror lobe was sampled)."""
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
+    return bs, vertex.finite(weight, active), mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+
+
+def bounce(
+    scene, lights, path: PathState, sampler, numbers: Numbers | None = None, *, bsdf=None, sampled: tuple | None = None,
+    follow: Callable | None = None, alone: Callable | None = None, direct: Callable | None = None,
+):  # fmt: skip
+    """Sample the BSDF where `path` stands, trace that ray, and find direct light. Returns (:class:`Bounce`, sampler).
+
+    lights   what chooses the light of next-event estimation (see ``mi_neural.lights.sampling``); None: the scene does
+    numbers  stratified ones in place of the sampler's own
+    bsdf     in place of the surface's
+    sampled  what :func:`sample_bsdf` gave before, in place of a new sample
+    follow   ``follow(bs, delta)`` says which rays are traced at all
+    alone    ``alone(pdf)`` says at which densities of the BSDF no ray will be traced, so that next-event estimation
+             counts in full
+    direct   in place of :func:`direct_light`, with the same arguments
+    """
+    si, active = path.si, path.active
+    if numbers is None:
+        numbers, sampler = draw_numbers(sampler)
+    bsdf = si.bsdf(path.ray) if bsdf is None else bsdf
+    bs, weight, delta = sampled or sample_bsdf(si, bsdf, numbers.lobe, numbers.direction, active)
+    followed = active & (dr.max(weight) > 0)
+    if follow is not None:
+        followed &= follow(bs, delta)
+    ray = si.spawn_ray(si.to_world(bs.wo))
+    si_next = scene.ray_intersect(ray, followed)
+    found = Bounce(bs, weight, delta, ray, si_next, followed, mi.Spectrum(0), mi.Spectrum(0))
+    found.L_nee, found.Le, sampler = (direct or direct_light)(
+        scene, lights, path, bsdf, found, numbers, sampler, alone
+    )  # fmt: skip
+    return found, sampler
+
+
+def direct_light(scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None):
+    """Both halves of direct light at a vertex: (next-event estimation, emission that the BSDF ray met, sampler).
+
+    They are weighted against each other, so that ``E[first + f/p second] = ∫ f Le cos dω``.
+    """
+    si, active, delta = path.si, path.active, found.delta
+    smooth = active & vertex.has_smooth(bsdf)
+    ref = vertex.reference_point(si.p, si.n)
+    ds_hit = mi.DirectionSample3f(scene, found.si, ref)
+
+    # ------------- A light: its sample, and the density of what the BSDF ray met -------------
+    if lights is None:
+        ds, light = scene.sample_emitter_direction(si, numbers.point, True, smooth)
+        pdf_light, sampled, emits = ds.pdf, smooth & (ds.pdf > 0), found.followed
+        pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~delta)
+    else:
+        table = lights.table
+        hit, emits = table.index_of(scene, found.si, found.followed)
+        n, transmits = vertex.receiver(si, bsdf)
+        choice = lights.choose(si, n, transmits, numbers.light, sampler, hit, active)
+        ds, light, pdf = table.sample(scene, si, choice.index, numbers.point, smooth & (choice.weight > 0))
+        light *= choice.weight
+        pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
+        pdf_hit = choice.pmf_hit * table.pdf(scene, si, hit, found.si, ds_hit, emits & ~delta)
+
+    # ------------------ Both techniques, weighted against each other -------------------------
+    f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), sampled)
+    if lights is not None:  # the scene has traced its shadow ray already
+        sampled &= dr.max(f * light) > 0
+        sampled &= ~scene.ray_test(si.spawn_ray_to(ds.p), sampled)
+    in_full = mi.Bool(ds.delta)
+    if alone is not None:
+        in_full |= alone(pdf_bsdf)
+    w_light = dr.select(in_full, 1, mis_weight(pdf_light, pdf_bsdf))
+    L_nee = vertex.finite(f * light * w_light, sampled)
+
+    w_bsdf = dr.select(delta, 1, mis_weight(found.bs.pdf, pdf_hit))
+    # What an emitter says that is not finite is seen and counted by the film, and by the training records
+    Le = found.si.emitter(scene, emits).eval(found.si, emits)
+    return L_nee, dr.select(emits, Le * w_bsdf, 0), sampler
+
+
+def emission_alone(scene, lights, path, bsdf, found: Bounce, numbers, sampler, alone=None):
+    """As :func:`direct_light` for mirrors, which no light sample can reach: the emission that the ray met."""
+    return mi.Spectrum(0), vertex.emission(scene, found.si, found.followed), sampler
+
+
+def advance(path: PathState, found: Bounce, max_depth: int = NO_LIMIT) -> PathState:
+    """The path at what its BSDF ray met, direct light taken up."""
+    depth = path.depth + 1
+    valid = path.valid | (path.active & ~mi.has_flag(found.bs.sampled_type, mi.BSDFFlags.Null))
+    return PathState(
+        path.L + path.β * found.direct, path.β * found.weight, path.η * found.bs.eta, depth, found.ray, found.si, valid,
+        found.followed & found.si.is_valid() & (depth < max_depth),
+    )  # fmt: skip
+
+
+def survival(path: PathState, rr_depth: int, share=1):
+    """Probability that a path survives Russian roulette, 1 up to `rr_depth` bounces.
+
+    It is the throughput times `share`, at most 0.95, without the factor that refraction gives radiance (η²)."""
+    q = dr.minimum(dr.max(path.β * share) * dr.square(path.η), 0.95)
+    return dr.select(path.depth > rr_depth, q, 1)
+
+
+def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None) -> tuple:
+    """(the path, which may have ended, throughput divided by the probability that it has not; sampler).
+
+    E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together.
+    """
+    q = survival(path, rr_depth, share)
+    u = sampler.next_1d() if u is None else u
+    alive = path.active & (u < q) & (dr.max(path.β) > 0)
+    return PathState(
+        path.L, path.β * dr.rcp(dr.maximum(q, 1e-6)), path.η, path.depth, path.ray, path.si, path.valid, alive
+    ), sampler
+
+
+def scene_has_mirrors(scene) -> bool:
+    """Whether some surface has no smooth lobe, as far as can be seen from here."""
+    bsdfs = [s.bsdf() for s in scene.shapes()]
+    hidden = any(s.class_name() == "Instance" for s in scene.shapes())
+    return hidden or any(b is None or not mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in bsdfs)
+
+
+def follow_mirrors(scene, path: PathState, sampler, max_depth: int, rr_depth: int) -> tuple:
+    """Go on through mirrors, glass and null surfaces to the first surface with a smooth lobe: (path, sampler).
+
+    The emission that is seen on the way is in ``path.L``. ``path.active`` is false where there is no such surface.
+    Where the scene has no mirrors nothing is compiled.
+    """
+    if not scene_has_mirrors(scene):
+        return path, sampler
+
+    def step(path, mirror, sampler):
+        found, sampler = bounce(scene, None, path, sampler, direct=emission_alone)
+        path = advance(path, found, max_depth)
+        path, sampler = roulette(path, sampler, rr_depth)
+        return path, vertex.is_mirror(path.si, path.active), sampler
+
+    mirror = vertex.is_mirror(path.si, path.active)
+    path, _, sampler = dr.while_loop(
+        (path, mirror, sampler), lambda path, mirror, sampler: mirror, step, label="mirrors"
+    )
+    return path, sampler

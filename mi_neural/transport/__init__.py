@@ -1,1 +1,0 @@
-"""What is traced: path vertices, training paths, termination, sample sequences. No module here knows a plugin."""
