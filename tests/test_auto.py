@@ -242,7 +242,7 @@ def test_twins_start_together_and_their_records_are_right(sphere):
     assert ok.mean() > 0.99
     for k in range(2):
         assert_mean(np.array(p.direct[k] + p.bounce[k])[0][ok], 1, "one more bounce", relative=1e-4)
-    n, w = (np.array(v)[:, : 2**13] for v in (records.surface.normal, traced.incident.direction))
+    n, w = (np.array(v)[:, : 2**13] for v in (traced.outgoing.surface.normal, traced.incident.direction))
     tangent = w - (w * n).sum(axis=0) * n
     products = (tangent[:, ::2] * tangent[:, 1::2]).sum(axis=0)
     assert_mean(products, 0, "directions of the two, along the surface")
