@@ -18,18 +18,15 @@ from mi_neural.caches.files import damaged
 from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.integrators import planning
-from mi_neural.integrators.checks import check_film, check_scene, sensor_of
+from mi_neural.integrators.base import FilmIntegrator, refuse_gradients
+from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.keys import SHARED_KEYS as SHARED_KEYS
 from mi_neural.integrators.lighting import light_sampler_of
-from mi_neural.render import path as paths
 from mi_neural.render.binding import SceneWatch
+from mi_neural.render.film import Area
 from mi_neural.render.frozen import undisturbed
 from mi_neural.render.sampling import PathSampler
 
-#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (measured, README).
-PASS_SAMPLES = 2**20
-#: Neighbouring pixels whose samples lie side by side: the lanes of a packet of AVX-512, half a warp.
-PACKET = 16
 #: Frames that `train_frames = -1` trains at least and at most.
 SETTLE_FRAMES = (128, 400)
 
@@ -52,26 +49,6 @@ def _other_scene(path) -> str:
     )
 
 
-def _opaque(numbers: tuple) -> list:
-    """Numbers as variables, so that no kernel is compiled anew when they change."""
-    return [dr.opaque(mi.Float, v) for v in numbers]
-
-
-def _sums(values: list, first, stride: int, count) -> list:
-    """Sums over the `count` entries ``first + k stride`` of each array."""
-    zeros = tuple(dr.zeros(mi.Float, dr.width(first)) for _ in values)
-
-    def add(k, *sums):
-        return k + 1, *(s + dr.gather(mi.Float, v, first + k * stride) for s, v in zip(sums, values, strict=True))
-
-    return list(dr.while_loop((mi.UInt32(0), *zeros), lambda k, *_: k < count, add, label="samples of a pixel")[1:])
-
-
-def coverage(valid):
-    """Share of a sample that covers its pixel, from a mask or from that share."""
-    return dr.select(valid, mi.Float(1), 0) if dr.is_mask_v(valid) else mi.Float(valid)
-
-
 def _in_keys(message: str) -> str:
     """A message of the library in the words of the plugin's keys."""
     names = {"n_paths": "train_samples", "n_vertices": "train_vertices", **{v: k for k, v in planning.SIZES.items()}}
@@ -85,8 +62,6 @@ class _State:
     integrator that it belongs to changes; this object it takes as a whole."""
 
     def __init__(self):
-        self.passes: dict = {}
-        self.planned_spp: int | None = None
         self.ns_per_query = math.nan
         self.facts: dict = {}  # what was measured of the scene
         self.plan: plan.ScenePlan | None = None  # of the scene that was rendered last
@@ -99,33 +74,26 @@ class _State:
         self.lights = None  # what chooses lights now; None: the scene itself
         self.images = 0
         self.queries = 0.0
-        self.nonfinite: list = []
         self.image_open = False
 
 
-class CacheIntegrator(mi.SamplingIntegrator):
+class CacheIntegrator(FilmIntegrator):
     """Base of the integrators that train a cache of incident radiance. Subclasses give `estimate`.
 
     The state lives from one ``render`` call to the next; another scene starts it anew.
     """
 
-    #: Extra channels: name -> number of values (3: R, G, B)
-    CHANNELS: dict[str, int] = {}  # noqa: RUF012
+    #: Numbers of a pixel while an image is made: colour, alpha, weight, and copies of them.
+    PIXEL_BYTES = 4 * FILM_VALUES
     #: Whether the plan may choose a light sampler where none is nested.
     CHOOSES_LIGHTS = False
 
     def __init__(self, props):
         super().__init__(props)
-        self.plugin = props.plugin_name()
-        self.max_depth = props.get("max_depth", -1)
-        self.rr_depth = props.get("rr_depth", 5)
-        self.hide = props.get("hide_emitters", False)
         self.train_frames = props.get("train_frames", -1)
         self.train_steps = props.get("train_steps", 1)
         self.freeze_cache = props.get("freeze_cache", False)
         self.seed = props.get("seed", 0)
-        self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
-        self._check(self.rr_depth >= 1, f"rr_depth is {self.rr_depth}; it must be at least 1")
         self._check(self.train_frames >= -1, f"train_frames is {self.train_frames}; give -1 (until settled), 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
@@ -146,10 +114,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             shape = FieldShape(**{planning.SIZES[k]: v for k, v in given.items()})
         except ValueError as e:
             raise ValueError(f"{self.plugin}: {_in_keys(str(e))}") from None
-        names = [n.strip() for n in props.get("channels", "").split(",") if n.strip()]
-        for n in names:
-            self._check(n in self.CHANNELS, f"unknown channel '{n}'; it has: {', '.join(self.CHANNELS)}")
-        self.channels = names
+        self._set_channels(props.get("channels", ""))
         self.light_sampler = self.nested_sampler = light_sampler_of(props)
         self.given = given
         if self.nested_sampler is not None:
@@ -165,16 +130,8 @@ class CacheIntegrator(mi.SamplingIntegrator):
         self.state = _State()
         self.reset()
 
-    def _check(self, ok: bool, message: str) -> None:
-        if not ok:
-            raise ValueError(f"{self.plugin}: {message}")
-
     # -------------------------------------------------------------------------------------------------------------
     # To be given by the plugin
-
-    def estimate(self, scene, lights, field, sampler, ray, settings, active):
-        """Radiance along camera rays: (L, valid, {channel: value}). `lights` chooses lights; None: the scene itself."""
-        raise NotImplementedError(f"{type(self).__name__} must define estimate()")
 
     def default_blend(self, props) -> str:
         """Which weights answer where no key says it."""
@@ -193,18 +150,28 @@ class CacheIntegrator(mi.SamplingIntegrator):
         cached = self.state.plan is None or self.state.plan.modelled("cache")
         return cached and (self.max_depth < 0 or self.max_depth > 2)
 
-    def settings(self, spp: int) -> tuple:
-        """Numbers that may change from image to image, handed on to `estimate` as variables; `spp`: the image's."""
-        return ()
-
     @property
     def queries_per_sample(self) -> float:
         return 0.0
 
+    def follow(self, other: CacheIntegrator, scene, sensor) -> None:
+        """Render with what `other` has bound, whose cache this integrator was given, and train nothing."""
+        self.state.lights = other.bound_lights
+        if not self.state.facts:
+            self.settle(scene, sensor)
+
     @property
-    def depth_limit(self) -> int:
-        """`max_depth` as a number to compare depths with."""
-        return paths.depth_limit(self.max_depth)
+    def bound_lights(self):
+        return self.state.lights
+
+    @property
+    def bound_field(self):
+        return self.cache.asked if self.needs_cache else None
+
+    @property
+    def trains(self) -> bool:
+        first = self.cache.steps == 0 and self.train_frames != 0
+        return self.needs_cache and not self.freeze_cache and (first or self.train_steps > 0)
 
     # -------------------------------------------------------------------------------------------------------------
     # State
@@ -213,6 +180,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Forget what was learned; the next image trains anew. Compiled kernels are kept."""
         self.cache.reset()
         self.state.reset()
+        self.film_state.nonfinite = []
         if self.light_sampler is not None:
             self.light_sampler.reset()
 
@@ -223,12 +191,12 @@ class CacheIntegrator(mi.SamplingIntegrator):
             self.light_sampler.reseed(seed)
         self.reset()
 
-    def _ready(self, scene, sensor, train: bool = True) -> None:
+    def bind(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
         known = self.state.watch.parts
         if self.state.watch.changed(scene) or self.state.signature is None:
             try:
-                self._meet(scene, known is not self.state.watch.parts)
+                self._begin(scene, known is not self.state.watch.parts)
                 if self.state.plan is None or known is not self.state.watch.parts:
                     planning.follow(self, planning.make_plan(self, scene, sensor))
             except ValueError:
@@ -255,7 +223,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
                 else:
                     self.cache.train(scene, sensor, self.state.lights, frames=self.train_steps)
 
-    def _meet(self, scene, is_another: bool) -> None:
+    def _begin(self, scene, is_another: bool) -> None:
         """Begin with a scene: refuse it, or see what it is."""
         check_scene(scene, self.plugin)
         if self.state.signature is not None:
@@ -265,7 +233,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
             raise CacheFileError(_other_scene(*self.state.loaded[:1]))
         self.state.signature = signature
         if is_another:
-            self.state.passes.clear()  # recordings of the other scene
+            self.film_state.forget_scene()
             self.cache.clear_recordings()
             self.state.facts = {}
 
@@ -288,7 +256,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def train_first(self, scene, sensor=0, progress=None) -> dict:
         """Train now as the first image would (`train_frames`), if nothing was learned yet. Returns the statistics."""
         sensor = self._sensor(scene, sensor)
-        self._ready(scene, sensor, train=False)
+        self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache and self.cache.steps == 0:
             self._train_first(scene, sensor, progress)
         return self.statistics()
@@ -296,7 +264,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train `frames` frames now. `progress` is called with (done, total). Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
-        self._ready(scene, sensor, train=False)
+        self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
             self.cache.train(scene, sensor, self.state.lights, frames=frames, progress=progress)
         return self.statistics()
@@ -304,7 +272,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
         """Train for about `seconds` of wall time. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
-        self._ready(scene, sensor, train=False)
+        self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
             self.cache.train(scene, sensor, self.state.lights, seconds=seconds, progress=progress)
         return self.statistics()
@@ -317,7 +285,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         """Say how many samples a pixel the finished image will have, when it is rendered in several calls."""
         if spp is None:
             self.state.image_open = False
-        self.state.planned_spp = spp
+        self.film_state.planned_spp = spp
 
     @contextmanager
     def previewing(self):
@@ -335,7 +303,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
         images, queries = self.state.images, self.state.queries
         untouched = self.cache.field is None
         known_lights = self.light_sampler is not None and self.light_sampler.statistics().get("visibility_steps")
-        self._ready(scene, sensor, train=False)
+        self.bind(scene, sensor, train=False)
         if self.needs_cache:
             state = None if untouched else self.cache.checkpoint()
             if not self.freeze_cache:
@@ -356,7 +324,9 @@ class CacheIntegrator(mi.SamplingIntegrator):
     def statistics(self) -> dict:
         """Facts since the last reset: training (see :class:`IncidentCache`), queries, non-finite samples."""
         s = dict(self.cache.statistics)
-        s["nonfinite"] += sum(int(n[0]) for n in self.state.nonfinite)
+        film = self.film_state.statistics()
+        s["nonfinite"] += film.pop("nonfinite")
+        s.update(film)
         s["queries"] = int(self.state.queries)
         s["images"] = self.state.images
         s.update(self.state.facts)
@@ -441,7 +411,7 @@ class CacheIntegrator(mi.SamplingIntegrator):
                                  "give it the same sizes")  # fmt: skip
         self.check_file(path, header)
         if scene is not None:
-            self._ready(scene, self._sensor(scene, 0), train=False)
+            self.bind(scene, self._sensor(scene, 0), train=False)
         known = self.state.signature
         if known is not None and header.get("scene") != known:
             raise CacheFileError(_other_scene(path))
@@ -453,146 +423,17 @@ class CacheIntegrator(mi.SamplingIntegrator):
         if field.shape != self.cache.shape:
             self.cache.shape = field.shape
             self.cache.clear_recordings()
-            self.state.passes.clear()
+            self.film_state.passes.clear()
 
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
 
-    def _sensor(self, scene, sensor):
-        return sensor_of(scene, sensor, self.plugin)
+    render_backward = render_forward = refuse_gradients
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
-        sensor = self._sensor(scene, sensor)
-        self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
-        check_film(sensor, self.plugin)
-        spp = spp or sensor.sampler().sample_count()
-        with dr.suspend_grad():
-            self._ready(scene, sensor)
-            block = self._render(scene, sensor, int(seed[0]) if hasattr(seed, "__len__") else int(seed), spp)
-            film = sensor.film()
-            film.prepare(self.aov_names())
-            film.put_block(block)
-            self.state.images += 1
-            self.state.image_open = self.state.planned_spp is not None
-            result = film.develop() if develop else mi.TensorXf()
-            if evaluate:
-                dr.eval(result)
-            return result
+    def rendered(self, spp: int) -> None:
+        self.state.images += 1
+        self.state.image_open = self.film_state.planned_spp is not None
 
-    def _render(self, scene, sensor, seed: int, spp: int):
-        """An image block with `spp` samples a pixel, in passes that fit memory."""
-        film = sensor.film()
-        film.prepare(self.aov_names())
-        block = film.create_block()
-        size = film.crop_size()
-        border = film.rfilter().border_size() if film.sample_border() else 0
-        width, height = int(size[0]) + 2 * border, int(size[1]) + 2 * border
-        n_pixels = width * height
-        settings = _opaque(self.settings(self.state.planned_spp or spp))
-        box = film.rfilter().is_box_filter()
-        field = self.cache.asked if self.needs_cache else None
-        keys = tuple((k, v) for k, v in vars(self).items() if type(v) in (int, float, str))
-
-        # A row of pixels at a time if one sample of all is too much, else several samples at a time
-        done = 0
-        while done < spp:
-            n = min(spp - done, max(1, PASS_SAMPLES // n_pixels))
-            rows = height if n * n_pixels <= 2 * PASS_SAMPLES else max(1, PASS_SAMPLES // (n * width))
-            for y in range(0, height, rows):
-                n_rows = min(rows, height - y)
-                key = (id(scene), id(sensor), width, n_rows, n, box, border, keys)
-                if key not in self.state.passes:
-                    self.state.passes[key] = self._frozen_pass(
-                        width, n_rows, n, border, box, self.cache.freezes(sensor)
-                    )
-                with undisturbed():
-                    pos, values, n_bad = self.state.passes[key](
-                        scene, sensor, self.state.lights, field, mi.UInt32(seed & 0xFFFFFFFF),
-                        dr.opaque(mi.UInt32, done), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, n_rows),
-                        dr.opaque(mi.UInt32, y), settings,
-                    )  # fmt: skip
-                self.state.nonfinite.append(n_bad)
-                block.set_coalesce(False)
-                block.put(pos, values)
-            done += n
-        self.state.queries += self.queries_per_sample * n_pixels * spp
-        if len(self.state.nonfinite) > 256:
-            self.state.nonfinite = [sum(self.state.nonfinite[1:], self.state.nonfinite[0])]
-            dr.eval(self.state.nonfinite)
-        return block
-
-    def _frozen_pass(self, width: int, n_rows: int, n_samples: int, border: int, box: bool, freeze: bool):
-        """A function that renders `n_samples` samples of some rows and returns what the film's block takes.
-
-        A packet of lanes holds one sample each of `PACKET` neighbouring pixels, the next packet the next samples of the
-        same: so lanes that run together may decide together (:meth:`PathSampler.together_1d`), and pixels stay
-        independent of one another in all their samples but that.
-        """
-        n_pixels = width * n_rows
-        n_lanes = -(-n_pixels // PACKET) * PACKET * n_samples
-
-        def render_pass(scene, sensor, lights, field, seed, first_sample, spp, rows, first_row, settings):
-            # `spp` and `rows` are `n_samples` and `n_rows` as variables: one kernel for all sizes of a pass
-            lane = dr.arange(mi.UInt32, n_lanes)
-            packet = lane // PACKET
-            local = packet // spp * PACKET + lane % PACKET
-            active = local < width * rows
-            pixel = local + first_row * width
-            sample = packet % spp + first_sample
-            scramble, _ = mi.sample_tea_32(pixel, seed, 4)
-            group, _ = mi.sample_tea_32(pixel // PACKET, seed ^ 0x2545F491, 4)
-            sampler = PathSampler.make(
-                pixel + sample * mi.UInt32(0x9E3779B9), seed ^ 0x5BF03635, sample, scramble, group
-            )
-            film = sensor.film()
-            corner = mi.Point2f(mi.Float(pixel % width) - border, mi.Float(pixel // width) - border)
-            pos = corner + mi.Point2f(film.crop_offset()) + sampler.stratified_2d(0)
-            pos_unit = (pos - mi.Point2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
-            aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-            time = sensor.shutter_open()
-            if sensor.shutter_open_time() > 0:
-                time += sampler.next_1d() * sensor.shutter_open_time()
-            ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), pos_unit, aperture)
-            ray.scale_differential(dr.rsqrt(mi.Float(spp)))
-
-            L, valid, extra = self.estimate(scene, lights, field, sampler, ray, settings, active)
-            L *= weight
-            ok = dr.all(dr.isfinite(L))
-            L = dr.select(ok, L, 0)
-            values = [L.x, L.y, L.z]
-            if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-                values.append(coverage(valid))
-            values.append(dr.select(ok & active, mi.Float(1), 0))
-            for name in self.channels:
-                value = extra[name]
-                values += [value.x, value.y, value.z] if self.CHANNELS[name] == 3 else [mi.Float(value)]
-            dr.eval(values, ok)  # one kernel; the sums below would otherwise run the whole estimate again, each
-            n_bad = dr.count(~ok & active)
-            if box:  # one value a pixel, the sum of its samples
-                local = dr.arange(mi.UInt32, n_pixels)
-                values = _sums(values, local // PACKET * PACKET * spp + local % PACKET, PACKET, spp)
-                first = local + first_row * width
-                pos = mi.Point2f(mi.Float(first % width) - border, mi.Float(first // width) - border)
-                pos += mi.Point2f(film.crop_offset()) + 0.5
-            dr.eval(pos, values, n_bad)
-            return pos, values, n_bad
-
-        return dr.freeze(render_pass, auto_opaque=False, enabled=freeze)
-
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Radiance along given rays, for integrators that wrap this one (``aov``, ``moment``)."""
-        self._ready(scene, scene.sensors()[0], train=self.state.images == 0)
-        self.state.images = max(self.state.images, 1)
-        lane = mi.UInt32(sampler.next_1d() * 2**24)
-        own = PathSampler.make(lane, mi.UInt32(sampler.next_1d() * 2**24))
-        settings = _opaque(self.settings(self.state.planned_spp or sampler.sample_count()))
-        L, valid, extra = self.estimate(scene, self.state.lights, self.cache.asked, own, ray, settings, mi.Bool(active))
-        aovs = []
-        for name in self.channels:
-            aovs += list(extra[name]) if self.CHANNELS[name] == 3 else [extra[name]]
-        return L, own.next_1d() < coverage(valid), aovs
-
-    def aov_names(self):
-        return [f"{n}.{c}" if self.CHANNELS[n] == 3 else n for n in self.channels
-                for c in ("RGB" if self.CHANNELS[n] == 3 else " ")]  # fmt: skip
+    def _render(self, scene, sensor, seed, spp: int):
+        self.state.queries += self.queries_per_sample * Area.of(sensor).n_pixels * spp
+        return super()._render(scene, sensor, seed, spp)

@@ -118,7 +118,7 @@ class NIRCIntegrator(CacheIntegrator):
         self.cache = cache
         self.given["cache"] = type(cache).__name__
         self.state.plan = None
-        self.state.passes.clear()
+        self.film_state.passes.clear()
         self.reset()
 
     @property

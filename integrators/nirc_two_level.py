@@ -102,14 +102,13 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         super().load_cache(path, scene)
         self.choice.reset()
 
-    def _meet(self, scene, is_another: bool) -> None:
-        super()._meet(scene, is_another)
+    def _begin(self, scene, is_another: bool) -> None:
+        super()._begin(scene, is_another)
         if is_another and self.mixed is not None:
-            self.mixed.nirc.state.passes.clear()
-            self.mixed.compiled.clear()
+            self.mixed.forget_scene()
 
-    def _ready(self, scene, sensor, train: bool = True) -> None:
-        super()._ready(scene, sensor, train)
+    def bind(self, scene, sensor, train: bool = True) -> None:
+        super().bind(scene, sensor, train)
         if not self.choice.may_ask or self.state.image_open or not (train or self.compiling):
             return
         with dr.suspend_grad():
@@ -120,7 +119,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
     def measure(self, scene, sensor=0) -> dict:
         """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
-        self._ready(scene, sensor, train=False)
+        self.bind(scene, sensor, train=False)
         if self.needs_cache and self.choice.may_ask:
             with dr.suspend_grad():
                 self.choice.measure(self, scene, sensor)
@@ -129,7 +128,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
         sensor = self._sensor(scene, sensor)
-        size, expected = sensor.film().crop_size(), self.state.planned_spp or spp or sensor.sampler().sample_count()
+        size, expected = sensor.film().crop_size(), self.planned_spp or spp or sensor.sampler().sample_count()
         before, pixels = self.choice.rendered, int(size[0]) * int(size[1])
         self.choice.rendered += expected * pixels
         result = super().render(scene, sensor, seed, spp, develop, evaluate)
@@ -159,7 +158,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         if self.mixed is not None:
             self.mixed.plan_samples(spp)
 
-    def _render(self, scene, sensor, seed: int, spp: int):
+    def _render(self, scene, sensor, seed, spp: int):
         if self.mixed is not None:
             take = self.mixed.compile if self.compiling else self.mixed.add
             take(scene, sensor, seed, spp, lambda seed, n: self._parts(scene, sensor, seed, n))
@@ -175,7 +174,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         values = mi.TensorXf(parts.shown(self.channels, n).astype(np.float32))
         return mi.ImageBlock(values, film.crop_offset(), film.rfilter())
 
-    def _parts(self, scene, sensor, seed: int, spp: int):
+    def _parts(self, scene, sensor, seed, spp: int):
         """A block of unbiased samples with all that variances and `progressive` are made of."""
         shown, self.channels = self.channels, self.inner_channels
         try:

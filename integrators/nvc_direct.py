@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from mi_neural.caches.direct import DirectCache, DirectTraining, albedo
 from mi_neural.caches.visibility import VisibilityCache
+from mi_neural.integrators.base import refuse_gradients
 from mi_neural.integrators.checks import check_scene
 from mi_neural.integrators.lighting import LightSamplingIntegrator, light_sampler_of
 from mi_neural.lights import clusters
@@ -20,8 +21,7 @@ from mi_neural.render.sampling import PathSampler
 
 MODES = ("sampled", "neural")
 CACHES = ("visibility", "radiance")
-CHANNELS = ("visibility", "light", "pmf")
-#: Bounces between mirrors from which Russian roulette may end a path.
+#: Bounces between mirrors from which Russian roulette may end a training path.
 RR_DEPTH = 8
 
 
@@ -60,6 +60,9 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
        - |int|
        - Longest path in segments, mirrors included: 1 shows emitters; with 2, mirrors show emitters only, and
          ``sampled`` has the mean of ``path`` with that depth; -1 means no limit. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Mirrors and glass from which Russian roulette may end a path. (Default: 5)
      * - hide_emitters
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
@@ -112,40 +115,32 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             mi.load_dict({"type": "nvc_direct", "mode": "neural"})
     """
 
-    freezes = differentiable = False
+    records = differentiable = False
+    CHANNELS = {"visibility": 1, "light": 1, "pmf": 1}  # noqa: RUF012
+    render_backward = render_forward = refuse_gradients
 
     def __init__(self, props):
         super().__init__(props)
         self.mode = props.get("mode", "sampled")
         self.kind = props.get("cache", "visibility")
         self.light_samples = props.get("light_samples", 1)
-        self.max_depth = props.get("max_depth", -1)
-        self.hide = props.get("hide_emitters", False)
         self.train_frames = props.get("train_frames", 256)
         self.train_steps = props.get("train_steps", 1)
         self.train_samples = props.get("train_samples", 8192)
         self.freeze_cache = props.get("freeze_cache", False)
         self.seed = props.get("seed", 0)
         self.light = props.get("light", 0)
-        self.channels = [n.strip() for n in props.get("channels", "").split(",") if n.strip()]
+        self._set_channels(props.get("channels", ""))
         for name, value, known in (("mode", self.mode, MODES), ("cache", self.kind, CACHES)):
             self._check(value in known, f"{name} is '{value}'; give one of: {', '.join(known)}")
         for name, value, least in (("light_samples", self.light_samples, 1), ("train_frames", self.train_frames, 0),
                                    ("train_steps", self.train_steps, 0), ("train_samples", self.train_samples, 4),
                                    ("seed", self.seed, 0), ("light", self.light, 0)):  # fmt: skip
             self._check(value >= least, f"{name} is {value}; it must be at least {least}")
-        self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
-        for n in self.channels:
-            self._check(n in CHANNELS, f"unknown channel '{n}'; it has: {', '.join(CHANNELS)}")
         self.light_sampler = light_sampler_of(props) or mi.load_dict({"type": "nvc_lights", "seed": self.seed})
-        self.depth_limit = self.max_depth if self.max_depth >= 0 else 0x7FFFFFFF
         trace = partial(direct_records, self.depth_limit)
         self.cache = DirectCache(trace, DirectTraining(self.train_samples), self.seed)
         self.reset()
-
-    def _check(self, ok: bool, message: str) -> None:
-        if not ok:
-            raise ValueError(f"{self.plugin}: {message}")
 
     @property
     def predicts(self) -> bool:
@@ -159,7 +154,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         """Forget what was learned; the next image trains anew."""
         self.light_sampler.reset()
         self.cache.reset()
-        self.watch = SceneWatch()
+        self.bound = SceneWatch()
         self.lights = None  # what chooses lights; None: the scene itself
         self.unshadowed: UnshadowedLights | None = None
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
@@ -176,14 +171,15 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             facts |= {"lights": 1, "light_groups": 1} | self.only_light.statistics
         return facts | (self.cache.statistics if self.kind == "radiance" else {})
 
-    def prepare_lights(self, scene, sensor, train: bool = True) -> None:
+    def bind(self, scene, sensor, train: bool = True) -> None:
         """Train as the keys say, and have all ready for an image of `scene` as it is now."""
-        if not self.watch.knows(scene):
+        if not self.bound.knows(scene):
             check_scene(scene, self.plugin)
-            if self.watch.parts is not None:
+            if self.bound.parts is not None:
                 self.reset()
             self.mixed = has_mixed_materials(scene)
-            self.watch.changed(scene)
+            self.film_state.forget_scene()
+            self.bound.changed(scene)
         with dr.resume_grad():
             self.lights = self.light_sampler.lights(scene, sensor, train)
             if self.kind == "radiance":
@@ -230,11 +226,10 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        if not self.entered and not self.watch.knows(scene):  # inside another integrator
-            self.prepare_lights(scene, scene.sensors()[0])
+    def estimate(self, scene, lights, field, sampler, ray, settings, active):
+        """E[L] = emission + direct light at the first surface that is not a mirror."""
         path = paths.camera_vertex(self, scene, mi.Ray3f(dr.detach(ray)), active)
-        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, RR_DEPTH)
+        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
         si, bsdf, active = path.si, path.si.bsdf(), path.active
 
         # Direct light at the first surface that is not a mirror
@@ -246,7 +241,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         else:
             direct = self.sampled(scene, path, sampler)
         L = path.L + dr.select(active, path.β * direct, 0)
-        return L, path.valid, self.extra(si, bsdf, sampler, active) if self.channels else []
+        return L, path.valid, self.extra(si, bsdf, sampler, active) if self.channels else {}
 
     def sampled(self, scene, path, sampler):
         """E = ∫ f Le cos dω, by `light_samples` pairs of a shadow ray and a BSDF ray."""
@@ -278,7 +273,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         si_next = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), seen)
         return weight * vertex.emission(scene, si_next, seen)
 
-    def extra(self, si, bsdf, sampler, active) -> list:
+    def extra(self, si, bsdf, sampler, active) -> dict:
         """The channels asked for, at the first surface that is not a mirror."""
         values = {}
         if "visibility" in self.channels:
@@ -291,10 +286,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             chosen = smooth & (choice.weight > 0)
             values["light"] = dr.select(chosen, mi.Float(choice.index), -1)
             values["pmf"] = dr.select(chosen, choice.pmf, 0)
-        return [values[name] for name in self.channels]
-
-    def aov_names(self):
-        return list(self.channels)
+        return values
 
     def to_string(self):
         return (

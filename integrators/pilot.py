@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.estimators import two_level
-from mi_neural.render.frozen import undisturbed
+from mi_neural.render.film import Area
 
 #: α by place, as a number among the settings.
 BY_PLACE = -1.0
@@ -199,37 +199,24 @@ class Pilot:
 
     def __init__(self, integrator, scene, sensor):
         self.integrator, self.scene, self.sensor = integrator, scene, sensor
-        film = sensor.film()
-        film.prepare(integrator.aov_names())
-        border = film.rfilter().border_size() if film.sample_border() else 0
-        width, height = (int(v) + 2 * border for v in film.crop_size())
-        self.rows = max(1, min(height // BANDS, PILOT_SAMPLES // (2 * BANDS * width)))
-        self.first = [int((k + 0.5) * height / BANDS - self.rows / 2) for k in range(BANDS if height >= BANDS else 1)]
-        self.spp = max(1, min(16, PILOT_SAMPLES // (width * self.rows * len(self.first))))
-        key = (id(scene), id(sensor), width, self.rows, self.spp, True, border)
-        if key not in integrator.state.passes:
-            integrator.state.passes[key] = integrator._frozen_pass(
-                width, self.rows, self.spp, border, True, integrator.cache.freezes(sensor)
-            )
-        self.run_pass = integrator.state.passes[key]
-        self.samples = width * self.rows * self.spp * len(self.first)
+        area = Area.of(sensor)
+        self.rows = max(1, min(area.height // BANDS, PILOT_SAMPLES // (2 * BANDS * area.width)))
+        bands = BANDS if area.height >= BANDS else 1
+        self.first = [int((k + 0.5) * area.height / BANDS - self.rows / 2) for k in range(bands)]
+        self.spp = max(1, min(16, PILOT_SAMPLES // (area.width * self.rows * bands)))
+        self.samples = area.width * self.rows * self.spp * bands
 
     def run(self, split: Split, passes: int = PILOT_PASSES, first_seed: int = 0):
         """(luminance by pass and pixel, seconds of each pass)."""
-        it = self.integrator
-        settings = [dr.opaque(mi.Float, v) for v in split.numbers()]
         images, seconds = [], []
         for k in range(first_seed * passes, (first_seed + 1) * passes):
             dr.sync_thread()
             t0 = time.perf_counter()
             bands = []
             for y in self.first:
-                with undisturbed():
-                    _, values, _ = self.run_pass(
-                        self.scene, self.sensor, it.state.lights, it.cache.asked, mi.UInt32(0x9107 + k),
-                        dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, self.spp), dr.opaque(mi.UInt32, self.rows),
-                        dr.opaque(mi.UInt32, y), settings,
-                    )  # fmt: skip
+                _, values = self.integrator.render_rows(
+                    self.scene, self.sensor, 0x9107 + k, (self.rows, self.spp), y, settings=split.numbers(), sums=True
+                )
                 bands.append(mi.luminance(mi.Color3f(*values[:3])) / self.spp)
             dr.eval(bands)
             dr.sync_thread()

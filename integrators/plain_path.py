@@ -61,23 +61,16 @@ class PlainPathIntegrator(LightSamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.max_depth = props.get("max_depth", -1)
-        self.rr_depth = props.get("rr_depth", 5)
-        self.hide = props.get("hide_emitters", False)
-        if self.max_depth < -1:
-            raise ValueError(f"plain_path: max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
         self.neural_depth = props.get("neural_depth", -1)
-        self.freezes = self.neural_depth < 0
+        self.records = self.neural_depth < 0
         self.unshadowed: UnshadowedLights | None = None
         if self.neural_depth < -1:
             raise ValueError(f"plain_path: neural_depth is {self.neural_depth}; give -1 (nowhere), 0, or more")
         if self.neural_depth >= 0 and not getattr(self.light_sampler, "visibility", False):
             raise ValueError("plain_path: neural_depth needs an nvc_lights with visibility=true as light_sampler")
-        if self.rr_depth < 1:
-            raise ValueError(f"plain_path: rr_depth is {self.rr_depth}; it must be at least 1")
 
-    def prepare_lights(self, scene, sensor, train: bool = True) -> None:
-        super().prepare_lights(scene, sensor, train)
+    def bind(self, scene, sensor, train: bool = True) -> None:
+        super().bind(scene, sensor, train)
         if self.neural_depth < 0 or self.lights is None:  # a single light is traced as ever
             self.unshadowed = None
             return
@@ -104,21 +97,19 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         L += self.unshadowed.total(scene, path.si, bsdf, lights.field.query(path.si.p), predicted)
         return L, Le, sampler
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        self.ready(scene)
-        limit = paths.depth_limit(self.max_depth)
+    def estimate(self, scene, lights, field, sampler, ray, settings, active):
+        """E[L] = Le + ∫ f L cos dω, at each vertex direct light plus the rest of the path."""
+        limit = self.depth_limit
         direct = self.direct if self.unshadowed is not None else None
 
         def step(path, sampler):
-            found, sampler = paths.bounce(scene, self.lights, path, sampler, direct=direct)
+            found, sampler = paths.bounce(scene, lights, path, sampler, direct=direct)
             path = paths.advance(path, found, limit)
             return paths.roulette(path, sampler, self.rr_depth)
 
         path = paths.camera_vertex(self, scene, mi.Ray3f(dr.detach(ray)), active)
-        path, sampler = dr.while_loop(
-            (path, sampler), lambda path, sampler: path.active, step, label="path"
-        )
-        return path.L, path.valid, []
+        path, sampler = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="path")
+        return path.L, path.valid, {}
 
     def to_string(self):
         return f"PlainPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}]"

@@ -133,12 +133,17 @@ class Mixed:
     def reset(self) -> None:
         self.begin()
 
+    def forget_scene(self) -> None:
+        """Forget what was compiled for the scene that was bound."""
+        self.nirc.film_state.forget_scene()
+        self.compiled.clear()
+
     def plan_samples(self, spp: int | None) -> None:
         """As ``CacheIntegrator.plan_samples``: until None, all calls of :meth:`add` are one image's."""
         if spp is None or not self.planned:
             self.begin()
         self.planned = spp is not None
-        self.nirc.state.planned_spp = spp
+        self.nirc.plan_samples(spp)
 
     @property
     def sample_share(self) -> float:
@@ -173,9 +178,7 @@ class Mixed:
     def _settle(self, scene, sensor) -> None:
         """The biased part's lights, and its number of light samples for the unbiased part, too: splitting there pays
         where direct light is noisy (Sponza 1.3, staircase 1.2, Cornell box 1.2 times less variance in equal time)."""
-        self.nirc.state.lights = self.integrator.state.lights
-        if not self.nirc.state.facts:
-            self.nirc.settle(scene, sensor)
+        self.nirc.follow(self.integrator, scene, sensor)
         self.integrator.choice.split_into(self.nirc.n_light)
 
     def add(self, scene, sensor, seed: int, spp: int, render) -> None:
@@ -184,14 +187,14 @@ class Mixed:
         self._settle(scene, sensor)
         if not self.planned:
             self.begin()
-            nirc.state.planned_spp = spp
+            nirc.plan_samples(spp)
         for n, unbiased in self.blocks(spp):
             if unbiased:
                 block = render(seed ^ 0x3C6EF372, n)
                 self.unbiased.add(Parts.of(block, self.integrator.inner_channels, self.integrator))
                 self.n_unbiased += n
             else:
-                block = Parts.of(nirc._render(scene, sensor, seed, n), BIASED, nirc)
+                block = Parts.of(nirc.render_block(scene, sensor, seed, n), BIASED, nirc)
                 self.biased.add(block)
                 self.squares = self.squares + n * np.square(block.indirect)
                 self.n_biased, self.n_blocks = self.n_biased + n, self.n_blocks + 1
@@ -200,7 +203,7 @@ class Mixed:
                 self.look()
         self.look()
         if not self.planned:
-            nirc.state.planned_spp = None
+            nirc.plan_samples(None)
 
     def compile(self, scene, sensor, seed: int, spp: int, render) -> None:
         """Compile what images of one call or several calls of `spp` samples need; ``render(seed, spp)`` as above."""
@@ -211,13 +214,13 @@ class Mixed:
             key = id(scene), id(sensor), size, n
             if key not in self.compiled:
                 for _ in range(2):  # the first recording of a frozen function differs from what it then replays
-                    dr.eval(nirc._render(scene, sensor, seed, n).tensor(), render(seed, n).tensor())
+                    dr.eval(nirc.render_block(scene, sensor, seed, n).tensor(), render(seed, n).tensor())
                 self.compiled.add(key)
 
     def look(self) -> None:
         """Find the correction anew, and the share of unbiased samples, if there are enough new samples."""
         n = self.n_biased + self.n_unbiased
-        nearly = n >= NEARLY * (self.nirc.state.planned_spp or 0)
+        nearly = n >= NEARLY * (self.nirc.planned_spp or 0)
         if self.n_unbiased < 2 or self.n_biased < 1 or n < (AGAIN_NEARLY if nearly else AGAIN) * self.found_at:
             return
         biased, unbiased = self.biased.indirect, self.unbiased.indirect

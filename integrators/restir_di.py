@@ -10,13 +10,15 @@ import numpy as np
 from mi_neural.estimators import reservoir
 from mi_neural.estimators.mis import mis_weight
 from mi_neural.estimators.reservoir import Reservoir
+from mi_neural.integrators.base import refuse_gradients
 from mi_neural.integrators.checks import check_film, check_scene, sensor_of
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.frozen import can_freeze, undisturbed
+from mi_neural.render.film import Area, camera_rays, coverage
+from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.sampling import PathSampler
 
 COMBINATIONS = ("unbiased", "biased")
@@ -208,7 +210,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         spp = spp or sensor.sampler().sample_count()
         seed = int(seed[0]) if hasattr(seed, "__len__") else int(seed)
         film = sensor.film()
-        with dr.suspend_grad():
+        with LOCK, dr.suspend_grad():
             film.prepare([])
             block = film.create_block()
             block.set_coalesce(False)
@@ -223,29 +225,36 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def _next_frame(self, scene, sensor, seed: int):
         """Render one frame: (positions, values) for the film's block."""
         s, film = self.state, sensor.film()
-        size = tuple(int(v) for v in film.crop_size())
-        border = film.rfilter().border_size() if film.sample_border() else 0
-        box = film.rfilter().is_box_filter()
+        area = Area.of(sensor)
         # The parts, not the scene, which may hold this integrator; they must live as long as the surfaces kept of them
-        key = (*scene.shapes(), *scene.emitters(), sensor, size, border)
+        key = (*scene.shapes(), *scene.emitters(), sensor, area)
         if len(key) != len(s.key) or any(a is not b and a != b for a, b in zip(key, s.key, strict=True)):
             check_scene(scene, "restir_di")
             s.reset()
             s.frames.clear()
-            s.key, s.freeze = key, can_freeze(sensor)
+            s.key, s.freeze = key, can_freeze_scene(scene)
 
         lights, facts = self._lights(scene, sensor)
         camera, pinhole = _camera(sensor)
         if s.past is None or s.past_power.table.n_lights != s.power.table.n_lights:
-            s.past = _nothing(np.prod([v + 2 * border for v in size]))
+            s.past = _nothing(area.n_pixels)
             s.past_power, s.past_camera = s.power, camera
-        facts = (facts, _facts(s.past_power.table), pinhole, size, border, box)
+        s.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        records = s.freeze and not is_recording()
+        facts = (facts, _facts(s.past_power.table), pinhole, area, s.alpha, records)
+        numbers = mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, s.frame)
+        rays = None
+        if records and not can_freeze(sensor):
+            pixel = dr.arange(mi.UInt32, area.n_pixels)
+            rays = camera_rays(sensor, area, pixel, _numbers(pixel, *numbers, 0x6A09E667))[:3]
+            dr.eval(rays)
         if facts not in s.frames:
-            s.frames[facts] = dr.freeze(self._frame_of(size, border, box, pinhole), auto_opaque=False, enabled=s.freeze)
+            frame = self._frame_of(area, pinhole)
+            s.frames[facts] = dr.freeze(frame, auto_opaque=False) if records else frame
         with undisturbed():
             pos, values, s.past = s.frames[facts](
-                scene, sensor, lights, s.power, s.past_power, s.past, s.past_camera, mi.UInt32(seed & 0xFFFFFFFF),
-                dr.opaque(mi.UInt32, s.frame),
+                scene, sensor if rays is None else None, rays, lights, s.power, s.past_power, s.past, s.past_camera,
+                *numbers,
             )  # fmt: skip
         s.past_power, s.past_camera = s.power, camera
         s.frame += 1
@@ -275,29 +284,20 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     # -------------------------------------------------------------------------------------------------------------
     # One frame
 
-    def _frame_of(self, size, border, box, pinhole):
+    def _frame_of(self, area: Area, pinhole: bool):
         """A function that renders one frame, to be recorded."""
-        width, height = (v + 2 * border for v in size)
+        border, size, width, height = area.border, area.size, area.width, area.height
 
-        def render_frame(scene, sensor, lights, power, past_power, past, past_camera, seed, frame):
-            pixel = dr.arange(mi.UInt32, width * height)
-            scramble, _ = mi.sample_tea_32(pixel, seed, 4)
-            stream, _ = mi.sample_tea_32(seed, frame, 4)
-            sampler = PathSampler.make(pixel, stream ^ 0x5BF03635, index=frame, scramble=scramble)
-            film = sensor.film()
-            corner = mi.Point2f(mi.Float(pixel % width) - border, mi.Float(pixel // width) - border)
-            pos = corner + sampler.stratified_2d(0)
-            aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-            time = sensor.shutter_open()
-            if sensor.shutter_open_time() > 0:
-                time += sampler.next_1d() * sensor.shutter_open_time()
-            ray, w_camera = sensor.sample_ray_differential(
-                time, sampler.next_1d(), pos / mi.Vector2f(mi.ScalarVector2f(size)), aperture
-            )
+        def render_frame(scene, sensor, rays, lights, power, past_power, past, past_camera, seed, frame):
+            pixel = dr.arange(mi.UInt32, area.n_pixels)
+            sampler = _numbers(pixel, seed, frame, 0x5BF03635)
+            if rays is None:
+                ray, w_camera, pos, sampler = camera_rays(sensor, area, pixel, sampler)
+            else:
+                ray, w_camera, pos = rays
 
             # ------------------- What the camera sees ---------------------
             L, valid, si, usable, sampler = self.first_surface(scene, ray, sampler, power)
-            w_camera = mi.Color3f(w_camera)
 
             # ------------- Where that was in the frame before -------------
             before, found = self.reproject(si, past, past_camera, size, border, pixel, pinhole, usable)
@@ -323,10 +323,10 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             ok = dr.all(dr.isfinite(L))
             L = dr.select(ok, L, 0)
             values = [L.x, L.y, L.z]
-            if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-                values.append(dr.select(valid, mi.Float(1), 0))
+            if self.state.alpha:
+                values.append(coverage(valid))
             values.append(dr.select(ok, mi.Float(1), 0))
-            pos = (corner + 0.5 if box else pos) + mi.Point2f(film.crop_offset())
+            pos = (area.corner(pixel) + 0.5 if area.box else pos) + mi.Point2f(mi.ScalarPoint2f(area.offset))
             past = Past(kept, si, usable)
             dr.eval(pos, values, past)
             return pos, values, past
@@ -503,6 +503,14 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 
     # -------------------------------------------------------------------------------------------------------------
 
+    render_backward = render_forward = refuse_gradients
+    plugin = "restir_di"
+
+    def statistics(self) -> dict:
+        """Facts since the last reset: frames, and what the light sampler says of itself."""
+        chooser = self.state.chooser
+        return {"frames": self.state.frame, **(chooser.statistics() if chooser is not None else {})}
+
     def sample(self, scene, sampler, ray, medium=None, active=True):
         raise RuntimeError("restir_di renders whole frames and cannot be nested in another integrator; use plain_path")
 
@@ -520,6 +528,13 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 def _visible(scene, si, p_light, active):
     """Whether nothing stands between a surface and a point on a light; false where not `active`."""
     return active & ~scene.ray_test(si.spawn_ray_to(p_light), active)
+
+
+def _numbers(pixel, seed, frame, salt: int) -> PathSampler:
+    """Random numbers of a frame."""
+    scramble, _ = mi.sample_tea_32(pixel, seed, 4)
+    stream, _ = mi.sample_tea_32(seed, frame, 4)
+    return PathSampler.make(pixel, stream ^ salt, index=frame, scramble=scramble)
 
 
 def _slim(si):

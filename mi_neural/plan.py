@@ -92,7 +92,7 @@ class SceneFacts:
         box = np.array(scene.bbox().extents(), np.float64).ravel()
         return cls(
             emitters, triangles, lights, surfaces, textures, (min(alphas), max(alphas)) if alphas else None,
-            None if sensor is None else tuple(int(n) for n in sensor.film().crop_size()),
+            None if not hasattr(sensor, "film") else tuple(int(n) for n in sensor.film().crop_size()),
             float(box.max()) if np.isfinite(box).all() else None,
             len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()),
         )  # fmt: skip

@@ -397,7 +397,7 @@ def test_frozen_functions_are_not_recorded_again_and_preparing_changes_nothing(b
     integrator = auto(train_frames=4, train_steps=1, train_samples=256)
     for k in range(4):
         render(box, integrator, 2, k)
-    functions = [integrator.cache._frame, *integrator.state.passes.values()]
+    functions = [integrator.cache._frame, *integrator.film_state.passes.recorded.values()]
     recorded = [f.n_recordings for f in functions]
     for k in range(6):
         render(box, integrator, 2, 10 + k)

@@ -65,7 +65,7 @@ def test_recordings_of_scenes_that_are_gone_are_not_kept(integrators):
     for _ in range(3):
         stress.cell(CASES["room"], stress.ENTRANTS["nirc"], 1, integrator=nirc)
     assert max(nirc.cache._frame.n_recordings, nirc.cache._probe.n_recordings) <= 3
-    assert len(nirc.state.passes) == 1
+    assert len(nirc.film_state.passes.recorded) == 1
 
 
 # ---------------------------------------------------------------- the judge

@@ -41,7 +41,8 @@ def running(sphere):
 
 
 def recordings(integrator) -> list[int]:
-    return [integrator.cache._frame.n_recordings, *(p.n_recordings for p in integrator.state.passes.values())]
+    passes = integrator.film_state.passes.recorded.values()
+    return [integrator.cache._frame.n_recordings, *(p.n_recordings for p in passes)]
 
 
 def test_number_of_recordings_is_constant_over_frames(sphere, running):
@@ -116,7 +117,7 @@ def test_changed_seed_is_not_baked_into_the_recording(sphere, trained):
 @pytest.fixture
 def small_passes(monkeypatch):
     def set_to(n):
-        monkeypatch.setattr(importlib.import_module("mi_neural.integrators.common"), "PASS_SAMPLES", n)
+        monkeypatch.setattr(importlib.import_module("mi_neural.integrators.common").CacheIntegrator, "PASS_SAMPLES", n)
 
     return set_to
 

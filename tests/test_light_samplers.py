@@ -161,7 +161,7 @@ def test_network_that_says_nonsense_gives_the_same_image(place, kind, nonsense):
         field = lights.field
         lights.field = type("Inverted", (), {"query": lambda self, x: [1 - v for v in field.query(x)]})()
         sampler.train = lambda scene, sensor: None
-        integrator.freezes = False  # such a field is no argument that it could take
+        integrator.records = False  # such a field is no argument that it could take
     else:
         scale = {"random": 30.0, "NaN": np.nan}[nonsense]
         new = {k: rng.normal(size=v.shape).astype(v.dtype) * np.array(scale, v.dtype) for k, v in parameters.items()}
@@ -390,7 +390,7 @@ def test_light_that_is_dimmed_is_not_recorded_anew(key):
             with dr.suspend_grad():
                 dr.eval(it.render(scene, spp=1, seed=k))
         counts.append([
-            *(p.n_recordings for p in nirc_.state.passes.values()), nirc_.cache._frame.n_recordings,
+            *(p.n_recordings for p in nirc_.film_state.passes.recorded.values()), nirc_.cache._frame.n_recordings,
             *(f.n_recordings for f in plain.images.frozen.values()), plain.light_sampler.cache._step.n_recordings,
         ])  # fmt: skip
     print(counts[0], counts[-1])
@@ -401,7 +401,7 @@ def test_frozen_image_is_the_one_that_is_not_frozen(place):
     """Whatever the seed and the number of samples; and a key that changes is seen."""
     scene, _ = place("two")
     frozen, plain = path_with("unshadowed", 4), path_with("unshadowed", 4)
-    plain.freezes = False
+    plain.records = False
     for seed, spp in ((0, 4), (1, 4), (2, 4), (3, 2), (4, 4)):
         with dr.suspend_grad():
             images = [np.array(it.render(scene, seed=seed, spp=spp)) for it in (frozen, plain)]

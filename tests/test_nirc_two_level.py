@@ -398,7 +398,7 @@ def test_image_does_not_depend_on_how_it_is_cut_into_passes(bench, sphere, monke
     error = pixels.std(axis=0, ddof=1) / 8
     assert (np.abs(pixels.mean(axis=0) - 1) < 5 * error + 1e-4).all(), "every pixel has its share of the samples"
     for size in (width * height, 3):
-        monkeypatch.setattr(common, "PASS_SAMPLES", size)
+        monkeypatch.setattr(common.CacheIntegrator, "PASS_SAMPLES", size)
         for k in range(2):
             np.testing.assert_allclose(render(sphere, integrator, 32, k, sensor=sensor), whole[k], rtol=1e-4)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from expectation import assert_mean, assert_same_mean, renders
 from test_incident import load
+from test_jit import recordings
 from test_nirc import room
 from test_vertex import lights, test_scene
 
@@ -428,10 +429,10 @@ def test_frozen_functions_are_not_recorded_again(sphere):
     integrator = nrc(train_frames=4, train_steps=1, train_samples=256)
     for k in range(4):
         render(sphere, integrator, 2, k)
-    recorded = [integrator.cache._frame.n_recordings, *(p.n_recordings for p in integrator.state.passes.values())]
+    recorded = recordings(integrator)
     for k in range(8):
         render(sphere, integrator, 2, 10 + k)
-    now = [integrator.cache._frame.n_recordings, *(p.n_recordings for p in integrator.state.passes.values())]
+    now = recordings(integrator)
     print(f"recordings {now}")
     assert now == recorded and max(now) <= 3
     assert integrator.cache.steps == 4 + 11

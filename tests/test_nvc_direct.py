@@ -166,7 +166,7 @@ def test_mirrors_are_followed(mode):
 def all_visible(integrator, scene) -> None:
     """Replace what the network of `integrator` says of `scene` by 1."""
     integrator.light_sampler.freeze = True
-    integrator.prepare_lights(scene, scene.sensors()[0])
+    integrator.bind(scene, scene.sensors()[0])
     field = integrator.lights.field
     field.query = lambda x: [mi.Float(1)] * field.shape.n_outputs
 

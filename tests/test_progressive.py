@@ -75,7 +75,7 @@ def test_recordings_of_another_scene_are_not_kept(box, sphere):
     integrator = two_level(mode="progressive", train_frames=2)
     for scene in (box, sphere, box):
         render(scene, integrator, 4)
-        assert len(integrator.mixed.nirc.state.passes) == 1 and integrator.mixed.n_biased == 4
+        assert len(integrator.mixed.nirc.film_state.passes.recorded) == 1 and integrator.mixed.n_biased == 4
         assert integrator.cache.steps == 2
 
 

@@ -173,7 +173,7 @@ def test_number_of_recordings_is_constant_over_thirty_images():
 
     def recordings():
         return [integrator.cache._frame.n_recordings, visibility._step.n_recordings,
-                *(p.n_recordings for p in integrator.state.passes.values())]  # fmt: skip
+                *(p.n_recordings for p in integrator.film_state.passes.recorded.values())]  # fmt: skip
 
     for k in range(5):
         integrator.render(scene, spp=1, seed=k)

@@ -10,25 +10,52 @@ from contextlib import contextmanager
 import drjit as dr
 import mitsuba as mi
 
+#: Held while an integrator of this package renders or trains: what one thread records, another must not disturb.
+LOCK = threading.RLock()
+#: Whether sensors can be recorded, by their kind.
+_freezes: dict[tuple, bool] = {}
+
 
 def can_freeze(sensor) -> bool:
-    """Whether Dr.Jit can freeze a function of this sensor.
+    """Whether Dr.Jit can freeze a function of this sensor; tried once for each kind of sensor.
 
-    Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold; a function of theirs must be
-    traced anew at each call.
+    Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold; rays of theirs are made
+    outside of recorded functions.
     """
+    key = mi.variant(), sensor.class_name(), str(sensor) if sensor.class_name() == "BatchSensor" else ""
+    if key not in _freezes:
+        _freezes[key] = _records(_ray_of, sensor)
+    return _freezes[key]
 
-    @dr.freeze
-    def probe(sensor, sample):
-        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sample, sample)
-        return ray.o, ray.d
 
+def _ray_of(sensor, sample):
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sample, sample)
+    return ray.o, ray.d
+
+
+def can_freeze_scene(scene) -> bool:
+    """Whether Dr.Jit can freeze a function of this scene (not with an ``ellipsoidsmesh`` in Mitsuba 3.9.1)."""
+    return _records(_hit_in, scene)
+
+
+def _hit_in(scene, sample):
+    ray = mi.Ray3f(mi.Point3f(sample.x, sample.y, 0), mi.Vector3f(0, 0, 1))
+    si = scene.ray_intersect(ray)
+    return si.t, si.n
+
+
+def _records(function, thing) -> bool:
     try:
         with dr.suspend_grad(), undisturbed():
-            probe(sensor, mi.Point2f(dr.opaque(mi.Float, 0.5, 2), dr.opaque(mi.Float, 0.25, 2)))
+            dr.freeze(function)(thing, mi.Point2f(dr.opaque(mi.Float, 0.5, 2), dr.opaque(mi.Float, 0.25, 2)))
     except RuntimeError:
         return False
     return True
+
+
+def is_recording() -> bool:
+    """Whether a function of the user's is being frozen, whose part this call is."""
+    return dr.flag(dr.JitFlag.FreezingScope)
 
 
 @contextmanager

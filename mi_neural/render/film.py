@@ -1,0 +1,259 @@
+"""Pixels to rays, and samples to film: the only place that makes camera rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from .frozen import can_freeze, undisturbed
+from .sampling import PathSampler
+
+#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (manual, 6_measured).
+PASS_SAMPLES = 2**20
+#: Neighbouring pixels whose samples lie side by side: the lanes of a packet of AVX-512, half a warp.
+PACKET = 16
+
+
+@dataclass(frozen=True)
+class Area:
+    """The part of a film that is rendered, in pixels.
+
+    width, height   with the border that a reconstruction filter may ask for
+    size, offset    of the crop window
+    border          pixels on each side beyond it
+    box             whether the filter is a box: then the samples of a pixel are added up, else each is put on the film
+    """
+
+    width: int
+    height: int
+    size: tuple[int, int]
+    offset: tuple[int, int]
+    border: int
+    box: bool
+
+    @classmethod
+    def of(cls, sensor) -> Area:
+        film = sensor.film()
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        size, offset = (tuple(int(v) for v in vector) for vector in (film.crop_size(), film.crop_offset()))
+        width, height = (v + 2 * border for v in size)
+        return cls(width, height, size, offset, border, film.rfilter().is_box_filter())
+
+    @property
+    def n_pixels(self) -> int:
+        return self.width * self.height
+
+    def corner(self, pixel):
+        """Corner of a pixel, in pixels of the crop window."""
+        return mi.Point2f(mi.Float(pixel % self.width) - self.border, mi.Float(pixel // self.width) - self.border)
+
+
+def camera_rays(sensor, area: Area, pixel, sampler) -> tuple:
+    """Rays through random places of pixels: (ray, weight, place in pixels of the crop window, sampler)."""
+    place = area.corner(pixel) + sampler.stratified_2d(0)
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    unit = place / mi.Vector2f(mi.ScalarVector2f(area.size))
+    ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), unit, aperture)
+    return ray, mi.Color3f(weight), place, sampler
+
+
+def film_rays(sensor, sampler) -> mi.Ray3f:
+    """Rays through random places of the whole film, stratified over it: one for each lane of `sampler`."""
+    ray, _ = sensor.sample_ray(
+        sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time(),
+        sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d(),
+    )  # fmt: skip
+    return mi.Ray3f(ray)
+
+
+class RaySensor:
+    """Rays in the place of the sensor that they came from. A PyTree.
+
+    It stands for sensors that Dr.Jit cannot record, and for the unknown sensor of an integrator that is wrapped by
+    another: that of the rays it is called with. As many rays as are asked for are taken in their order; fewer or more
+    are chosen by the place on the film.
+    """
+
+    DRJIT_STRUCT = {"o": object, "d": object, "time": object}  # noqa: RUF012
+
+    def __init__(self, ray=None):
+        if ray is not None:
+            self.o, self.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
+            self.time = mi.Float(dr.detach(ray.time))
+            self._widen(dr.width(ray))
+            dr.eval(self.o, self.d, self.time)
+
+    def _widen(self, n: int) -> None:
+        zero = dr.zeros(mi.Float, n)
+        self.o, self.d, self.time = self.o + zero, self.d + zero, self.time + zero
+
+    @classmethod
+    def of(cls, sensor, n: int, seed: int) -> RaySensor:
+        """`n` rays of `sensor`, spread evenly over its film."""
+        lane, seed = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        return cls(film_rays(sensor, PathSampler.make(lane, seed, index=lane, scramble=seed)))
+
+    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        n, wanted = dr.width(self.time), dr.width(sample2)
+        if wanted == n:
+            index = dr.arange(mi.UInt32, n)
+        else:
+            index = dr.minimum(mi.UInt32(sample2.x * n), n - 1)
+        ray = mi.Ray3f(dr.gather(mi.Point3f, self.o, index), dr.gather(mi.Vector3f, self.d, index))
+        ray.time = dr.gather(mi.Float, self.time, index)
+        return ray, mi.Spectrum(1)
+
+    def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
+        ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+        return mi.RayDifferential3f(ray), weight
+
+    def class_name(self):
+        return "RaySensor"
+
+    def shutter_open(self):
+        return 0.0
+
+    def shutter_open_time(self):
+        return 0.0
+
+    def needs_aperture_sample(self):
+        return False
+
+
+def recordable(sensor, n: int, seed: int):
+    """`sensor`, or `n` rays of it where it cannot be part of a recorded function."""
+    return sensor if isinstance(sensor, RaySensor) or can_freeze(sensor) else RaySensor.of(sensor, n, seed)
+
+
+@dataclass
+class Samples:
+    """Which camera samples a pass renders; numbers as variables, so that one kernel serves all sizes. A PyTree."""
+
+    seed: mi.UInt32
+    first_sample: mi.UInt32
+    n_samples: mi.UInt32
+    first_row: mi.UInt32
+    n_rows: mi.UInt32
+
+    def lanes(self, area: Area, n_lanes: int) -> tuple:
+        """(pixel, number of the sample in its pixel, active) for each lane.
+
+        A packet of lanes holds one sample each of `PACKET` neighbouring pixels, the next packet the next samples of the
+        same: so lanes that run together may decide together (:meth:`PathSampler.together_1d`), and pixels stay
+        independent of one another in all their samples but that.
+        """
+        lane = dr.arange(mi.UInt32, n_lanes)
+        packet = lane // PACKET
+        local = packet // self.n_samples * PACKET + lane % PACKET
+        return (local + self.first_row * area.width, packet % self.n_samples + self.first_sample,
+                local < area.width * self.n_rows)  # fmt: skip
+
+    def sampler(self, pixel, sample, salt: int) -> PathSampler:
+        """Random numbers of these samples; another `salt` gives other independent ones, the same stratified ones."""
+        scramble, _ = mi.sample_tea_32(pixel, self.seed, 4)
+        group, _ = mi.sample_tea_32(pixel // PACKET, self.seed ^ 0x2545F491, 4)
+        lane = pixel + sample * mi.UInt32(0x9E3779B9)
+        return PathSampler.make(lane, self.seed ^ salt, sample, scramble, group)
+
+
+def coverage(valid):
+    """Share of a sample that covers its pixel, from a mask or from that share."""
+    return dr.select(valid, mi.Float(1), 0) if dr.is_mask_v(valid) else mi.Float(valid)
+
+
+def _sums(values: list, first, stride: int, count) -> list:
+    """Sums over the `count` entries ``first + k stride`` of each array."""
+    zeros = [dr.zeros(mi.Float, dr.width(first)) for _ in values]
+
+    def add(k, totals):
+        return k + 1, [s + dr.gather(mi.Float, v, first + k * stride) for s, v in zip(totals, values, strict=True)]
+
+    return dr.while_loop((mi.UInt32(0), zeros), lambda k, _: k < count, add, label="samples of a pixel")[1]
+
+
+class Passes:
+    """Renders camera samples by recorded functions, each traced once and then replayed.
+
+    ``estimate(scene, lights, field, sampler, ray, settings, active)`` gives (L, coverage or mask, {channel: value}).
+    One recording serves all sensors of a kind; `clear` forgets them, which would keep what they were made for.
+    """
+
+    def __init__(self):
+        self.recorded: dict[tuple, Callable] = {}
+
+    def clear(self) -> None:
+        self.recorded.clear()
+
+    def run(self, estimate, channels: dict[str, int], keys: tuple, scene, sensor, lights, field, samples: Samples,
+            sizes: tuple[int, int], settings, record: bool = True, sums: bool = False) -> tuple:  # fmt: skip
+        """Render `samples` of ``sizes = (rows, samples a pixel)``: (places, values for the film's block, number of
+        samples that were not finite). `channels`: values of each, by name; `keys`: what `estimate` depends on."""
+        area, film = Area.of(sensor), sensor.film()
+        if sums:  # as with a box filter
+            area = replace(area, box=True)
+        alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        n_pixels = area.width * sizes[0]
+        n_lanes = -(-n_pixels // PACKET) * PACKET * sizes[1]
+        offset = dr.opaque(mi.Point2f, [float(v) for v in area.offset])
+        direct = record and can_freeze(sensor)
+        rays = None
+        if record and not direct:
+            pixel, sample, _ = samples.lanes(area, n_lanes)
+            rays = camera_rays(sensor, area, pixel, samples.sampler(pixel, sample, 0x6A09E667))[:3]
+            dr.eval(rays)
+        key = (kind_of(sensor) if direct else "", area.width, area.size, area.border, area.box, alpha, sizes,
+               tuple(channels), keys, record)  # fmt: skip
+        if key not in self.recorded:
+            plain = _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes)
+            self.recorded[key] = dr.freeze(plain, auto_opaque=False) if record else plain
+        with undisturbed():
+            return self.recorded[key](
+                scene, sensor if rays is None else None, rays, lights, field, samples, offset, settings
+            )
+
+
+def kind_of(sensor) -> tuple:
+    """What a recorded function takes for granted of a sensor."""
+    return sensor.class_name(), bool(sensor.needs_aperture_sample()), sensor.shutter_open_time() > 0
+
+
+def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixels: int, n_lanes: int) -> Callable:
+    """A function that renders one pass, to be recorded."""
+
+    def render_pass(scene, sensor, rays, lights, field, samples, offset, settings):
+        pixel, sample, active = samples.lanes(area, n_lanes)
+        sampler = samples.sampler(pixel, sample, 0x5BF03635)
+        if rays is None:
+            ray, weight, place, sampler = camera_rays(sensor, area, pixel, sampler)
+        else:
+            ray, weight, place = rays
+        ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
+
+        L, valid, extra = estimate(scene, lights, field, sampler, ray, settings, active)
+        L = mi.Color3f(L * weight)
+        ok = dr.all(dr.isfinite(L))
+        L = dr.select(ok, L, 0)
+        values = [L.x, L.y, L.z]
+        if alpha:
+            values.append(coverage(valid))
+        values.append(dr.select(ok & active, mi.Float(1), 0))
+        for name, size in channels.items():
+            values += [*extra[name]] if size == 3 else [mi.Float(extra[name])]
+        dr.eval(values, ok)  # one kernel; the sums below would otherwise run the whole estimate again, each
+        n_bad = dr.count(~ok & active)
+        if area.box:  # one value a pixel, the sum of its samples
+            local = dr.arange(mi.UInt32, n_pixels)
+            n = samples.n_samples
+            values = _sums(values, local // PACKET * PACKET * n + local % PACKET, PACKET, n)
+            place = area.corner(local + samples.first_row * area.width) + 0.5
+        place = place + offset
+        dr.eval(place, values, n_bad)
+        return place, values, n_bad
+
+    return render_pass
