@@ -207,6 +207,7 @@ class _FilmState:
         self.passes = Passes()
         self.planned_spp: int | None = None
         self.nonfinite: list = []
+        self.n_bound = 0
         self.entered = False  # whether Mitsuba's own render() is under way, which calls sample()
         self._estimate = None
         self._records: bool | None = None

@@ -16,8 +16,6 @@ FILM_VALUES = 16
 
 def check_scene(scene, plugin: str) -> None:
     """Refuse, before any work, a scene that cannot be rendered; the message says what to do."""
-    if not scene.sensors():
-        raise ValueError(f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>")
     if not scene.emitters():
         raise ValueError(f"{plugin}: the scene has no emitter, the image would be black; add a light")
     for sensor in scene.sensors():
@@ -92,7 +90,10 @@ def sensor_of(scene, sensor, plugin: str):
     if not isinstance(sensor, int):
         return sensor
     if not scene.sensors():
-        check_scene(scene, plugin)
+        raise ValueError(
+            f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>, or give one to "
+            "mi.render(scene, sensor=...)"
+        )
     if not 0 <= sensor < len(scene.sensors()):
         raise ValueError(f"{plugin}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
     return scene.sensors()[sensor]

@@ -23,7 +23,7 @@ from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.keys import SHARED_KEYS as SHARED_KEYS
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import SceneWatch
-from mi_neural.render.film import Area
+from mi_neural.render.film import Area, recordable
 from mi_neural.render.frozen import undisturbed
 from mi_neural.render.sampling import PathSampler
 
@@ -158,7 +158,7 @@ class CacheIntegrator(FilmIntegrator):
         """Render with what `other` has bound, whose cache this integrator was given, and train nothing."""
         self.state.lights = other.bound_lights
         if not self.state.facts:
-            self.settle(scene, sensor)
+            self.settle(scene, self._view(sensor))
 
     @property
     def bound_lights(self):
@@ -193,12 +193,13 @@ class CacheIntegrator(FilmIntegrator):
 
     def bind(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
+        view = self._view(sensor)
         known = self.state.watch.parts
         if self.state.watch.changed(scene) or self.state.signature is None:
             try:
                 self._begin(scene, known is not self.state.watch.parts)
                 if self.state.plan is None or known is not self.state.watch.parts:
-                    planning.follow(self, planning.make_plan(self, scene, sensor))
+                    planning.follow(self, planning.make_plan(self, scene, view))
             except ValueError:
                 self.state.watch.parts = known
                 raise
@@ -206,22 +207,22 @@ class CacheIntegrator(FilmIntegrator):
             # Settings are measured with lights chosen as they will be; an image rendered in several calls is one frame
             learn = (train and not self.state.image_open) or not self.state.facts
             with dr.suspend_grad():
-                self.state.lights = self.light_sampler.lights(scene, sensor, train=learn)
+                self.state.lights = self.light_sampler.lights(scene, view, train=learn)
         if not self.needs_cache:
             if not self.state.facts:
-                self.settle(scene, sensor)
+                self.settle(scene, view)
             return
         with dr.resume_grad():
             if self.cache.field is None:
-                self.cache.start(scene, sensor, self.state.lights)
+                self.cache.start(scene, view, self.state.lights)
             if not self.state.facts:
                 with dr.suspend_grad():
-                    self.settle(scene, sensor)
+                    self.settle(scene, view)
             if train and not self.freeze_cache and not self.state.image_open:
                 if self.state.images == 0 and self.cache.steps == 0:
-                    self._train_first(scene, sensor)
+                    self._train_first(scene, view)
                 else:
-                    self.cache.train(scene, sensor, self.state.lights, frames=self.train_steps)
+                    self.cache.train(scene, view, self.state.lights, frames=self.train_steps)
 
     def _begin(self, scene, is_another: bool) -> None:
         """Begin with a scene: refuse it, or see what it is."""
@@ -248,9 +249,13 @@ class CacheIntegrator(FilmIntegrator):
         check_scene(scene, self.plugin)
         return planning.make_plan(self, scene, sensor)
 
-    def _train_first(self, scene, sensor, progress=None) -> None:
+    def _view(self, sensor):
+        """What is learned with in the place of `sensor`: other rays of it each time, where it cannot be recorded."""
+        return recordable(sensor, self.seed * 0x9E3779B9 + self.cache.steps)
+
+    def _train_first(self, scene, view, progress=None) -> None:
         auto = self.train_frames < 0
-        self.cache.train(scene, sensor, self.state.lights, frames=None if auto else self.train_frames,
+        self.cache.train(scene, view, self.state.lights, frames=None if auto else self.train_frames,
                          at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1], progress=progress)  # fmt: skip
 
     def train_first(self, scene, sensor=0, progress=None) -> dict:
@@ -258,7 +263,7 @@ class CacheIntegrator(FilmIntegrator):
         sensor = self._sensor(scene, sensor)
         self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache and self.cache.steps == 0:
-            self._train_first(scene, sensor, progress)
+            self._train_first(scene, self._view(sensor), progress)
         return self.statistics()
 
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
@@ -266,7 +271,7 @@ class CacheIntegrator(FilmIntegrator):
         sensor = self._sensor(scene, sensor)
         self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
-            self.cache.train(scene, sensor, self.state.lights, frames=frames, progress=progress)
+            self.cache.train(scene, self._view(sensor), self.state.lights, frames=frames, progress=progress)
         return self.statistics()
 
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
@@ -274,7 +279,7 @@ class CacheIntegrator(FilmIntegrator):
         sensor = self._sensor(scene, sensor)
         self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
-            self.cache.train(scene, sensor, self.state.lights, seconds=seconds, progress=progress)
+            self.cache.train(scene, self._view(sensor), self.state.lights, seconds=seconds, progress=progress)
         return self.statistics()
 
     def train_fraction(self, seconds: float) -> float:
@@ -308,7 +313,7 @@ class CacheIntegrator(FilmIntegrator):
             state = None if untouched else self.cache.checkpoint()
             if not self.freeze_cache:
                 for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
-                    self.cache.train_frame(scene, sensor, self.state.lights)
+                    self.cache.train_frame(scene, self._view(sensor), self.state.lights)
         with dr.suspend_grad():
             for _ in range(2):
                 dr.eval(self._render(scene, sensor, 1, spp))

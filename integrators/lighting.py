@@ -8,6 +8,7 @@ import mitsuba as mi
 from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.render.binding import SceneWatch
+from mi_neural.render.film import recordable
 from mi_neural.render.frozen import LOCK
 
 LIGHT_SAMPLER_KEY = """
@@ -55,8 +56,9 @@ class LightSamplingIntegrator(FilmIntegrator):
             check_scene(scene, self.plugin)
             self.film_state.forget_scene()
             self.bound.changed(scene)
+        self.film_state.n_bound += 1
         if self.light_sampler is not None:
-            self.lights = self.light_sampler.lights(scene, sensor, train)
+            self.lights = self.light_sampler.lights(scene, recordable(sensor, self.film_state.n_bound), train)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if not (self.differentiable and _differentiates()):

@@ -23,6 +23,7 @@ from mi_neural.integrators.keys import SHARED_KEYS
 from mi_neural.integrators.planning import SIZES
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
+from mi_neural.render.film import film_rays
 from mi_neural.render.sampling import PathSampler
 
 #: Caches of incident radiance without a network
@@ -143,7 +144,7 @@ class NIRCIntegrator(CacheIntegrator):
         n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
-        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sampler.stratified_2d(0), mi.Point2f(0.5))
+        ray = film_rays(sensor, sampler.stratified_2d(0), sampler)
         path = paths.camera_vertex(self, scene, ray, mi.Bool(True))
         path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
 

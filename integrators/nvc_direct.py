@@ -17,6 +17,7 @@ from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.binding import SceneWatch
+from mi_neural.render.film import recordable
 from mi_neural.render.sampling import PathSampler
 
 MODES = ("sampled", "neural")
@@ -180,6 +181,8 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             self.mixed = has_mixed_materials(scene)
             self.film_state.forget_scene()
             self.bound.changed(scene)
+        sensor = recordable(sensor, self.film_state.n_bound)
+        self.film_state.n_bound += 1
         with dr.resume_grad():
             self.lights = self.light_sampler.lights(scene, sensor, train)
             if self.kind == "radiance":

@@ -17,7 +17,7 @@ from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.film import Area, camera_rays, coverage
+from mi_neural.render.film import Area, camera_rays, coverage, recordable
 from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.sampling import PathSampler
 
@@ -234,7 +234,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             s.frames.clear()
             s.key, s.freeze = key, can_freeze_scene(scene)
 
-        lights, facts = self._lights(scene, sensor)
+        lights, facts = self._lights(scene, recordable(sensor, s.frame))
         camera, pinhole = _camera(sensor)
         if s.past is None or s.past_power.table.n_lights != s.power.table.n_lights:
             s.past = _nothing(area.n_pixels)
@@ -577,7 +577,7 @@ def _camera(sensor) -> tuple:
     false where the rays do not meet or a further one disagrees, and the matrix then means nothing.
     """
     x, y = np.array([0, 1, 0, 1, 0.3], np.float32), np.array([0, 0, 1, 1, 0.6], np.float32)
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
     d = np.array(ray.d + dr.zeros(mi.Vector3f, 5), np.float64)
     o = np.array(ray.o + dr.zeros(mi.Point3f, 5), np.float64)
     to_film, eye, pinhole = np.eye(3), o.mean(axis=1), False

@@ -14,6 +14,7 @@ import mitsuba as mi
 from ..estimators.spread import PathSpread
 from ..render import path as paths
 from ..render import vertex
+from ..render.film import film_rays
 from ..render.sampling import PathSampler
 from ..render.surface import Roughened, surface_of
 from .records import OutgoingRecords, TrainingRecords, empty_surfaces, leave_out_nonfinite
@@ -81,11 +82,7 @@ def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple 
     """Rays from random points of the film; so many others to random `places` instead: positions and directions to
     their viewers (world space; not finite where unknown), and how far before them to start."""
     # Stratified over the film: paths are the samples of one pixel, the film
-    ray, _ = sensor.sample_ray(
-        sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time(),
-        sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d(),
-    )  # fmt: skip
-    ray = mi.Ray3f(ray)
+    ray = film_rays(sensor, sampler.stratified_2d(0), sampler)
     if places is None or world_share <= 0:
         return ray
     # Every so many-th lane, evenly: multiples of the golden ratio

@@ -63,46 +63,51 @@ def camera_rays(sensor, area: Area, pixel, sampler) -> tuple:
     return ray, mi.Color3f(weight), place, sampler
 
 
-def film_rays(sensor, sampler) -> mi.Ray3f:
-    """Rays through random places of the whole film, stratified over it: one for each lane of `sampler`."""
-    ray, _ = sensor.sample_ray(
-        sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time(),
-        sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d(),
-    )  # fmt: skip
+def film_rays(sensor, place, sampler) -> mi.Ray3f:
+    """Rays through `place`, in [0, 1]² of the film; time and aperture are drawn from `sampler`."""
+    time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
+    sample = sensor.sample_ray_differential  # all of Mitsuba's sensors have it; some have no sample_ray()
+    ray, _ = sample(time, sampler.next_1d(), mi.Point2f(place), sampler.next_2d())
     return mi.Ray3f(ray)
+
+
+#: Rays along a side of the film that stand for a sensor which cannot be recorded.
+SIDE = 256
 
 
 class RaySensor:
     """Rays in the place of the sensor that they came from. A PyTree.
 
     It stands for sensors that Dr.Jit cannot record, and for the unknown sensor of an integrator that is wrapped by
-    another: that of the rays it is called with. As many rays as are asked for are taken in their order; fewer or more
-    are chosen by the place on the film.
+    another: that of the rays it is called with. A ray is chosen by the place on the film, as far as that is known: of
+    `side` x `side` rays the nearest, else any.
     """
 
     DRJIT_STRUCT = {"o": object, "d": object, "time": object}  # noqa: RUF012
+    side = 0
 
-    def __init__(self, ray=None):
-        if ray is not None:
-            self.o, self.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
-            self.time = mi.Float(dr.detach(ray.time))
-            self._widen(dr.width(ray))
-            dr.eval(self.o, self.d, self.time)
-
-    def _widen(self, n: int) -> None:
-        zero = dr.zeros(mi.Float, n)
-        self.o, self.d, self.time = self.o + zero, self.d + zero, self.time + zero
+    def __init__(self, ray=None, side: int = 0):
+        if ray is None:  # as Dr.Jit makes one
+            return
+        zero = dr.zeros(mi.Float, dr.width(ray))
+        self.side = side
+        self.o, self.d = mi.Point3f(dr.detach(ray.o)) + zero, mi.Vector3f(dr.detach(ray.d)) + zero
+        self.time = mi.Float(dr.detach(ray.time)) + zero
+        dr.eval(self.o, self.d, self.time)
 
     @classmethod
-    def of(cls, sensor, n: int, seed: int) -> RaySensor:
-        """`n` rays of `sensor`, spread evenly over its film."""
-        lane, seed = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
-        return cls(film_rays(sensor, PathSampler.make(lane, seed, index=lane, scramble=seed)))
+    def of(cls, sensor, seed: int) -> RaySensor:
+        """Rays of `sensor`, spread evenly over its film."""
+        lane, seed = dr.arange(mi.UInt32, SIDE * SIDE), dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        sampler = PathSampler.make(lane, seed)
+        place = mi.Point2f(mi.Float(lane % SIDE), mi.Float(lane // SIDE)) + sampler.next_2d()
+        return cls(film_rays(sensor, place / SIDE, sampler), SIDE)
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
-        n, wanted = dr.width(self.time), dr.width(sample2)
-        if wanted == n:
-            index = dr.arange(mi.UInt32, n)
+        n, side = dr.width(self.time), self.side
+        if side:
+            x, y = (mi.UInt32(dr.clip(v * side, 0, side - 1)) for v in (sample2.x, sample2.y))
+            index = y * side + x
         else:
             index = dr.minimum(mi.UInt32(sample2.x * n), n - 1)
         ray = mi.Ray3f(dr.gather(mi.Point3f, self.o, index), dr.gather(mi.Vector3f, self.d, index))
@@ -126,9 +131,9 @@ class RaySensor:
         return False
 
 
-def recordable(sensor, n: int, seed: int):
-    """`sensor`, or `n` rays of it where it cannot be part of a recorded function."""
-    return sensor if isinstance(sensor, RaySensor) or can_freeze(sensor) else RaySensor.of(sensor, n, seed)
+def recordable(sensor, seed: int):
+    """`sensor`, or rays of it where it cannot be part of a recorded function. Another `seed` gives other rays."""
+    return sensor if can_freeze(sensor) else RaySensor.of(sensor, seed)
 
 
 @dataclass

@@ -19,8 +19,8 @@ _freezes: dict[tuple, bool] = {}
 def can_freeze(sensor) -> bool:
     """Whether Dr.Jit can freeze a function of this sensor; tried once for each kind of sensor.
 
-    Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold; rays of theirs are made
-    outside of recorded functions.
+    Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold, and `irradiancemeter` has no
+    ``sample_ray``; rays of theirs are made outside of recorded functions.
     """
     key = mi.variant(), sensor.class_name(), str(sensor) if sensor.class_name() == "BatchSensor" else ""
     if key not in _freezes:
@@ -30,7 +30,8 @@ def can_freeze(sensor) -> bool:
 
 def _ray_of(sensor, sample):
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, sample, sample)
-    return ray.o, ray.d
+    other, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, sample, sample)  # some sensors have none
+    return ray.o, ray.d, other.o, other.d
 
 
 def can_freeze_scene(scene) -> bool:
