@@ -12,4 +12,4 @@ says what to type. Listed here and written there is all that a new plugin needs;
 if __name__ != "mi_neural.integrators":
     raise ImportError(f"'{__name__}' is the source folder of mi_neural.integrators; type: import mi_neural.integrators")
 
-PLUGINS = ("plain_path", "nirc", "nirc_two_level", "nrc", "nvc_direct", "restir_di")
+PLUGINS = ("plain_path", "nirc", "nirc_two_level", "nrc", "neural_path", "nvc_direct", "restir_di")

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.integrators.checks import check_film, sensor_of
+from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
 from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording
@@ -30,8 +31,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
     #: Bytes that are held at once of each pixel at one sample a pixel.
     PIXEL_BYTES = 64
 
-    def __init__(self, props):
-        super().__init__(props)
+    def __init__(self, props: Keys):
+        super().__init__(props.props)
         self.plugin = props.plugin_name()
         self.max_depth = props.get("max_depth", -1)
         self.rr_depth = props.get("rr_depth", 5)

@@ -20,7 +20,6 @@ from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.integrators import planning
 from mi_neural.integrators.base import FilmIntegrator, refuse_gradients
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
-from mi_neural.integrators.keys import SHARED_KEYS as SHARED_KEYS
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import SceneWatch
 from mi_neural.render.film import Area, recordable

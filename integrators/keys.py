@@ -1,6 +1,60 @@
 """Rows of the keys that all integrators with caches have, for their docstrings."""
 
-from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY
+import mitsuba as mi
+
+LIGHT_SAMPLER_KEY = """
+     * - light_sampler
+       - |emitter|
+       - Nested plugin that chooses the light of each shadow ray: ``uniform_lights``, ``power_lights``, ``nvc_lights``.
+         (Default: the scene's own choice, as in ``path``)
+"""
+
+
+#: Keys of whole numbers that have no default of their own.
+WHOLE = ("levels", "hashmap_size", "width", "hidden_layers", "cache_samples", "residual_samples")
+
+
+class Keys:
+    """A plugin's properties, which refuse a value of another kind than that of the key's default."""
+
+    def __init__(self, props):
+        self.props = props
+
+    def get(self, name: str, default):
+        value = self.props.get(name, default)
+        if name in WHOLE and default is None and value is not None:
+            default = 0
+        if isinstance(default, bool):
+            self._check(isinstance(value, bool), name, value, "true or false")
+        elif isinstance(default, int):
+            whole = isinstance(value, int | float) and not isinstance(value, bool) and value == int(value)
+            self._check(whole, name, value, "a whole number")
+            value = int(value)
+        elif isinstance(default, float):
+            self._check(isinstance(value, int | float) and not isinstance(value, bool), name, value, "a number")
+            value = float(value)
+        elif isinstance(default, str):
+            self._check(isinstance(value, str), name, value, "a text")
+        return value
+
+    def _check(self, ok: bool, name: str, value, kind: str) -> None:
+        if not ok:
+            raise ValueError(f"{self.props.plugin_name()}: {name} is {value!r}; give {kind}")
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.props
+
+    def __getitem__(self, name: str):
+        return self.props[name]
+
+    def plugin_name(self) -> str:
+        return self.props.plugin_name()
+
+
+def register(name: str, cls) -> None:
+    """Make an integrator known to Mitsuba; `cls` may be a function that makes it of :class:`Keys`."""
+    mi.register_integrator(name, lambda props: cls(Keys(props)))
+
 
 SHARED_KEYS = (
     """
@@ -29,9 +83,9 @@ SHARED_KEYS = (
        - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
      * - learning_rate
        - |float|
-       - Of Adam, at the start; falls to a tenth. With ``termination="auto"`` it is that of the integrator's own cache,
-         and the outgoing one learns at three times the rate of the incident one. (Default: 0.01, ``nrc`` 0.03, but
-         0.01 with a ``blend`` other than ``ema``)
+       - Of Adam, at the start; falls to a tenth. In ``neural_path`` it is that of the outgoing cache; the incident one
+         learns at a third of it. (Default: 0.01, ``nrc`` and ``neural_path`` 0.03, but 0.01 with a ``blend`` other than
+         ``ema``)
      * - ema_decay
        - |float|
        - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)

@@ -11,13 +11,6 @@ from mi_neural.render.binding import SceneWatch
 from mi_neural.render.film import recordable
 from mi_neural.render.frozen import LOCK
 
-LIGHT_SAMPLER_KEY = """
-     * - light_sampler
-       - |emitter|
-       - Nested plugin that chooses the light of each shadow ray: ``uniform_lights``, ``power_lights``, ``nvc_lights``.
-         (Default: the scene's own choice, as in ``path``)
-"""
-
 
 def light_sampler_of(props):
     """The nested light sampler of a plugin's properties, None without one. Raises ValueError for anything else."""

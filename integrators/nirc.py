@@ -11,15 +11,13 @@ import numpy as np
 from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
 from mi_neural.caches.incident import IncidentCache
-from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
-from mi_neural.caches.pair import PairCache
+from mi_neural.caches.outgoing import OutgoingCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.estimators import spread
-from mi_neural.integrators import automatic
-from mi_neural.integrators.automatic import AUTO
 from mi_neural.integrators.common import CacheIntegrator
-from mi_neural.integrators.keys import SHARED_KEYS
+from mi_neural.integrators.keys import SHARED_KEYS, register
+from mi_neural.integrators.neural_path import alias
 from mi_neural.integrators.planning import SIZES
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
@@ -28,7 +26,7 @@ from mi_neural.render.sampling import PathSampler
 
 #: Caches of incident radiance without a network
 CONTROLS = {"spatial_hash": SpatialHashCache, "sh_grid": HarmonicCache}
-TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "auto")
+TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
 #: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
 #: the cache's directional detail does not suffice for it.
 SHARP_PDF = 3.0
@@ -64,13 +62,6 @@ class NIRCIntegrator(CacheIntegrator):
                     f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
         self._check(self.gather_half >= 0, f"gather_half is {self.gather_half}; it must be 0 or more")
-        if self.termination == "auto":
-            automatic.check(self)
-            self._check(self.cache_samples > 0, "cache_samples is 0; termination 'auto' needs at least 1")
-            training = OutgoingTraining.like(self.cache.training, threshold=self.spread_threshold)
-            self.cache = PairCache(
-                training, self.cache.training, self.cache.shape, self.seed, n_queries=self.cache_samples
-            )
         self._choose_cache(props.get("cache", "plan"))
         if self.cache_samples == 0:
             self.given["cache"] = False
@@ -86,7 +77,6 @@ class NIRCIntegrator(CacheIntegrator):
         if kind not in CONTROLS:
             return
         control, known = CONTROLS[kind], self.cache
-        self._check(self.termination != "auto", f"termination 'auto' needs cache 'network', not '{kind}'")
         self._check(kind != "spatial_hash" or known.blend == "ema",
                     f"blend is '{known.blend}'; a spatial hash has one set of means and needs 'ema'")  # fmt: skip
         sizes = {name: self.given[key] for key, name in SIZES.items() if key in self.given}
@@ -99,20 +89,14 @@ class NIRCIntegrator(CacheIntegrator):
         self.cache = control(known.training, shape, self.seed, blend=known.blend, reliability=known.reliability)
 
     def default_blend(self, props) -> str:
-        blends = self.plan_mode == "everything" and props.get("termination", "adaptive") != "auto"
-        return "reliability" if blends else "ema"
-
-    @property
-    def caches(self) -> tuple[str, ...]:
-        return ("outgoing", "incident") if self.termination == "auto" else ("incident",)
+        return "reliability" if self.plan_mode == "everything" else "ema"
 
     def use_cache(self, cache) -> None:
         """Train and ask `cache` from now on; it starts anew, with the constants of training that it was made with.
 
         An :class:`~mi_neural.caches.incident.IncidentCache`, or one of a class of your own that derives from it, see
-        :mod:`mi_neural.caches.arrays`. Raises ValueError for another, and with termination ``auto``, which has two.
+        :mod:`mi_neural.caches.arrays`. Raises ValueError for another.
         """
-        self._check(self.termination != "auto", "termination 'auto' has two caches of its own; use_cache() takes one")
         fits = isinstance(cache, IncidentCache) and not isinstance(cache, OutgoingCache)
         self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
                     f"{type(cache).__name__}")  # fmt: skip
@@ -128,8 +112,6 @@ class NIRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
-        if self.termination == "auto":
-            return automatic.QUERIES if self.needs_cache else 0.0
         return 0.0 if not self.needs_cache else max(self.cache_samples, self.n_light)
 
     @property
@@ -139,7 +121,7 @@ class NIRCIntegrator(CacheIntegrator):
 
     def settle(self, scene, sensor) -> None:
         """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene."""
-        if self.light_samples > 0 or self.termination == "auto":
+        if self.light_samples > 0:
             return
         n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
@@ -168,14 +150,9 @@ class NIRCIntegrator(CacheIntegrator):
         if self.state.plan is not None:
             self.state.plan.decisions["light_samples"] = chosen
 
-    def probe(self, field, x, sampler):
-        return super().probe(getattr(field, "incident", field), x, sampler)
-
     def settings(self, spp: int) -> tuple:
-        """The image's sample count for ``auto``; else the share of far light that is gathered: with ``adaptive`` 0 for
-        a single sample a pixel, 1/2 after `gather_half` more."""
-        if self.termination == "auto":
-            return (float(spp),)
+        """The share of far light that is gathered: with ``adaptive`` 0 for a single sample a pixel, 1/2 after
+        `gather_half` more."""
         if self.termination != "adaptive":
             return ({"primary": 0.0, "spread": 1.0, "balanced": 0.0}[self.termination],)
         more = max(spp - 1, 0)
@@ -186,11 +163,6 @@ class NIRCIntegrator(CacheIntegrator):
     def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`."""
         (mixture,) = settings
-        if self.termination == "auto":
-            L, visible, c = automatic.estimate(self, scene, lights, field, sampler, ray, mixture, active)
-            names = {"direct": "traced", "cache": "cached", "depth": "depth", "share": "share"}
-            empty = {n: mi.Color3f(0) if k == 3 else mi.Float(0) for n, k in self.CHANNELS.items()}
-            return L, visible, empty | {name: c[theirs] for name, theirs in names.items()}
         path = paths.camera_vertex(self, scene, ray, active)
         path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
         si, active, n_light = path.si, path.active, self.n_light
@@ -209,7 +181,7 @@ class NIRCIntegrator(CacheIntegrator):
         coverage = dr.select(active, traced.covered / n_light, dr.select(path.valid, 1.0, 0.0))
 
         channels = {"direct": path.β * direct, "cache": path.β * cache, "residual": path.β * residual}
-        channels |= {"depth": path.depth + mi.Float(traced.n_rays) / n_light, "share": mi.Float(0)}
+        channels |= {"depth": path.depth + mi.Float(traced.n_rays) / n_light}
         channels |= sigma_channels(field if features is not None else None, si.p, vertex.facing(si))
         return L, coverage, {k: dr.select(active, v, 0) for k, v in channels.items()}
 
@@ -339,7 +311,7 @@ class NIRCIntegrator(CacheIntegrator):
 
 
 NIRCIntegrator.CHANNELS = {
-    "direct": 3, "cache": 3, "residual": 3, "sigma": 1, "preference": 1, "depth": 1, "share": 1
+    "direct": 3, "cache": 3, "residual": 3, "sigma": 1, "preference": 1, "depth": 1
 }  # fmt: skip
 NIRCIntegrator.__doc__ = (
     r"""
@@ -371,7 +343,7 @@ NIRCIntegrator.__doc__ = (
        - Share of far light that is gathered. ``primary``: none, least noise, most bias. ``spread``: all, the path goes
          on until its spread exceeds that of the pixel (Müller et al. 2021, sec. 3.4). ``balanced``: 1 - t with
          t = Nc p_f / (Nc p_f + p_g) (Dereviannykh et al.). ``adaptive``: none for one sample a pixel, growing with the
-         image's sample count, as noise gives way to bias. ``auto``: another estimator, see below. (Default: adaptive)
+         image's sample count, as noise gives way to bias. (Default: adaptive)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is asked per camera sample. 0: no cache, ``nirc`` is a path tracer.
@@ -393,15 +365,11 @@ NIRCIntegrator.__doc__ = (
        - |float|
        - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)"""
     + SHARED_KEYS
-    + AUTO
     + r"""
-    It traces one BSDF sample a vertex (``light_samples``, ``gather_half`` have no effect).
-
     Channels: ``direct``, ``cache``, ``residual`` (RGB each); with visible emission they sum to the image. ``sigma``:
     weight of the network being trained, at the first vertex; ``preference``: 1 where it exceeds 1/2. Its mean over a
     frame's records is ``reliability`` in the statistics. ``depth``: mean length of paths in segments, those that find
-    direct light alone not counted. With ``auto``: ``direct`` is all that was traced, ``share`` the weight of the
-    outgoing cache at the first vertex.
+    direct light alone not counted.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
     participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside
@@ -426,4 +394,4 @@ NIRCIntegrator.__doc__ = (
             image = mi.render(scene, integrator=integrator, spp=16)
     """
 )
-mi.register_integrator("nirc", lambda props: NIRCIntegrator(props))
+register("nirc", lambda props: (alias(props) or NIRCIntegrator)(props))

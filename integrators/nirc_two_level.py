@@ -12,7 +12,8 @@ import numpy as np
 from mi_neural.caches.control import ControlCache
 from mi_neural.estimators import two_level
 from mi_neural.integrators import pilot, progressive
-from mi_neural.integrators.common import SHARED_KEYS, CacheIntegrator
+from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.pilot import Split
 from mi_neural.integrators.progressive import UNBIASED, Parts
 from mi_neural.render import path as paths
@@ -479,4 +480,4 @@ NIRCTwoLevelIntegrator.__doc__ = (
             print(integrator.statistics()["split"])
     """
 )
-mi.register_integrator("nirc_two_level", lambda props: NIRCTwoLevelIntegrator(props))
+register("nirc_two_level", NIRCTwoLevelIntegrator)

@@ -9,6 +9,7 @@ from mi_neural.caches.direct import DirectCache, DirectTraining, albedo
 from mi_neural.caches.visibility import VisibilityCache
 from mi_neural.integrators.base import refuse_gradients
 from mi_neural.integrators.checks import check_scene
+from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import LightSamplingIntegrator, light_sampler_of
 from mi_neural.lights import clusters
 from mi_neural.lights.sampling import VisibleLights
@@ -323,4 +324,4 @@ def direct_records(max_depth: int, scene, sensor, lights, n: int, seed):
     return mi.Point3f(si.p), mi.Color3f(dr.select(valid, target, 0)), valid
 
 
-mi.register_integrator("nvc_direct", lambda props: NVCDirectIntegrator(props))
+register("nvc_direct", NVCDirectIntegrator)

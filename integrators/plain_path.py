@@ -5,7 +5,8 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.lighting import LIGHT_SAMPLER_KEY, LightSamplingIntegrator
+from mi_neural.integrators.keys import LIGHT_SAMPLER_KEY, register
+from mi_neural.integrators.lighting import LightSamplingIntegrator
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
@@ -115,4 +116,4 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         return f"PlainPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}]"
 
 
-mi.register_integrator("plain_path", lambda props: PlainPathIntegrator(props))
+register("plain_path", PlainPathIntegrator)

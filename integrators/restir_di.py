@@ -12,6 +12,7 @@ from mi_neural.estimators.mis import mis_weight
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators.base import refuse_gradients
 from mi_neural.integrators.checks import check_film, check_scene, sensor_of
+from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
@@ -156,7 +157,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     """
 
     def __init__(self, props):
-        super().__init__(props)
+        super().__init__(props.props)
         self.hide, self.max_depth = props.get("hide_emitters", False), 2
         self.initial_candidates = props.get("initial_candidates", 8)
         self.history = props.get("history", 20.0)
@@ -601,4 +602,4 @@ def _camera(sensor) -> tuple:
     return (matrix, eye), pinhole
 
 
-mi.register_integrator("restir_di", lambda props: ReSTIRDirectIntegrator(props))
+register("restir_di", ReSTIRDirectIntegrator)

@@ -119,7 +119,7 @@ def test_settings_hold_what_an_integrator_has():
     found = {s.name: s for s in controls.settings(nirc)}
     assert found["cache_samples"].choices(nirc) == (1, 2, 3, 4, 8, 16)
     assert "termination" in found
-    for other in ({"type": "nirc", "termination": "auto"}, {"type": "nrc"}):
+    for other in ({"type": "neural_path"}, {"type": "nrc"}):
         assert "termination" not in {s.name for s in controls.settings(mi.load_dict(other))}
 
 

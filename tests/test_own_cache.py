@@ -111,8 +111,6 @@ def test_reset_forgets(sphere):
 def test_what_it_cannot_ask_is_refused(wrong):
     with pytest.raises(ValueError, match=f"takes an IncidentCache.*{wrong.__name__}"):
         mi.load_dict(KEYS).use_cache(wrong())
-    with pytest.raises(ValueError, match="auto"):
-        mi.load_dict({**KEYS, "termination": "auto"}).use_cache(MeanCache())
 
 
 def test_what_is_missing_is_named():

@@ -1,0 +1,101 @@
+"""What ``nrc`` and ``neural_path`` share: how a cache of outgoing radiance is trained."""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+
+from mi_neural import plan
+from mi_neural.caches.field import CacheFileError
+from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.integrators.common import CacheIntegrator
+
+#: The constants of a training step in the words of the plugins' keys
+KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cache_content",
+        "threshold": "spread_threshold", "roughening": "roughening"}  # fmt: skip
+#: Rows of these keys, for the docstrings
+OUTGOING_KEYS = """
+     * - inputs
+       - |string|
+       - What the network of outgoing radiance knows of a surface beside its position: a list of ``normal``, ``view``,
+         ``albedo``, ``roughness``; ``plan``: what the scene needs. A cache that was loaded keeps its own. (Default:
+         plan)
+     * - train_suffix
+       - |string|
+       - Where training paths end: ``spread``, at the second vertex where the path has become wide, or ``full``, at
+         ``train_vertices`` whatever the spread. (Default: spread)
+     * - world_share
+       - |float|
+       - Share of the training paths that start where records of all earlier frames lay, so that what leaves the view
+         is not forgotten. (Default: 0.25)
+     * - unbounded_share
+       - |float|
+       - Share of the training paths that run on to their natural end, without self-training: more where light enters
+         by many reflections, and the cache starts too dark. (Default: 0.25)
+     * - roughening
+       - |float|
+       - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first
+         vertex, mirrors or glass): less noise in the records, some bias. (Default: 0)"""
+
+
+class OutgoingIntegrator(CacheIntegrator):
+    """Base of the integrators that train a cache of outgoing radiance."""
+
+    CHOOSES_LIGHTS = True
+    content = "reflected"
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.spread_threshold = props.get("spread_threshold", 0.01)
+        self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
+        inputs = props.get("inputs", "plan")
+        if inputs != "plan":
+            names = {n.strip() for n in inputs.split(",") if n.strip()}
+            self._check(names <= set(plan.INPUTS), f"inputs is '{inputs}'; give a list of: {', '.join(plan.INPUTS)}")
+            self.given |= {name: name in names for name in plan.INPUTS}
+        if not math.isfinite(self.spread_threshold):
+            self.given["cache"] = False
+        # A path of infinite spread threshold never queries the cache; its training paths end by the paper's constant
+        self.outgoing_keys = {
+            "threshold": self.spread_threshold if math.isfinite(self.spread_threshold) else 0.01,
+            "suffix": props.get("train_suffix", "spread"),
+            "world_share": props.get("world_share", 0.25),
+            "unbounded_share": props.get("unbounded_share", OutgoingTraining.unbounded_share),
+            "roughening": props.get("roughening", 0.0),
+            "learning_rate": self.cache.training.learning_rate,
+        }
+
+    def outgoing_training(self) -> OutgoingTraining:
+        """Constants of training of the cache of outgoing radiance; ValueError for keys out of range."""
+        try:
+            return OutgoingTraining.like(self.cache.training, content=self.content, **self.outgoing_keys)
+        except ValueError as e:
+            message = str(e)
+            for name, key in KEYS.items():
+                message = message.replace(f"{name} is", f"{key} is")
+            raise ValueError(f"{self.plugin}: {message}") from None
+
+    def default_rate(self, blend: str) -> float:
+        return OutgoingTraining.learning_rate if blend == "ema" else super().default_rate(blend)
+
+    @property
+    def needs_cache(self) -> bool:
+        return super().needs_cache and math.isfinite(self.spread_threshold)
+
+    # -------------------------------------------------------------------------------------------------------------
+
+    PROBES = 1
+
+    def probe(self, field, x, sampler):
+        normal, w = (mi.warp.square_to_uniform_sphere(sampler.next_2d()) for _ in range(2))
+        field = getattr(field, "outgoing", field)
+        return field.query(x, normal, w, mi.Color3f(sampler.next_1d()), sampler.next_1d())
+
+    def file_facts(self) -> dict:
+        return {**super().file_facts(), "content": self.content}
+
+    def check_file(self, path, header: dict) -> None:
+        if header.get("content", self.content) != self.content:
+            raise CacheFileError(f"'{path}' holds {header['content']} light; set cache_content to {header['content']}")
+
