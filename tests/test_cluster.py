@@ -18,10 +18,11 @@ import pytest
 from scipy import stats
 from typer.testing import CliRunner
 
+from mi_neural.bench import benchmark, budget, changes, cluster, jobs, load, sequence
+from mi_neural.bench.load import InputError
 from mi_neural.cli import app
-from mi_neural.measure import benchmark, budget, changes, cluster, exr, jobs, load, sequence
-from mi_neural.measure.load import InputError
-from mi_neural.measure.moments import Moments
+from mi_neural.image import exr
+from mi_neural.image.moments import Moments
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'mi_neural[cluster]'")
 

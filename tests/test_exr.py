@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 
 @pytest.fixture

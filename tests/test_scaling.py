@@ -8,8 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fake_cache import register
+from load_study import load_study
 
-from mi_neural.measure import budget, load, memory, scaling, split
+from mi_neural.bench import budget, load, memory, split
+
+scaling = load_study("scaling")
 
 
 def points(costs: dict[float, float]) -> list[scaling.Point]:

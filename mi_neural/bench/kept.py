@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from . import exr
+from mi_neural.image import exr
+
 from .benchmark import WITHOUT_PICTURE, Picture, Row, judge, plain
 from .reference import Reference
 

@@ -11,9 +11,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from mi_neural.measure import benchmark, budget, exr, load, repeats, report
-from mi_neural.measure import reference as references
-from mi_neural.measure.load import InputError
+from mi_neural.bench import benchmark, budget, load, repeats, report
+from mi_neural.bench import reference as references
+from mi_neural.bench.load import InputError
+from mi_neural.image import exr
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 

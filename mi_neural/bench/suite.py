@@ -9,21 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import (
-    benchmark,
-    cluster,
-    collection,
-    denoise,
-    environment,
-    exr,
-    jobs,
-    kept,
-    load,
-    page,
-    repeats,
-    report,
-    terminal,
-)
+from mi_neural.image import exr
+
+from . import benchmark, cluster, collection, denoise, environment, jobs, kept, load, page, repeats, report, terminal
 from . import reference as references
 from .load import InputError
 

@@ -1,4 +1,4 @@
-"""Open Image Denoise with albedo and normals as guides: what a user would do without a cache.
+"""The denoiser in a comparison: its guides, and the time that it takes (:mod:`mi_neural.image.denoise` denoises).
 
 The guides come from Mitsuba's `aov` integrator and are the same for all integrators of a comparison, so that none has a
 better denoiser than another. Their time is reported apart and belongs to no integrator.
@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
+from mi_neural.image import denoise as oidn
 
 from .budget import STREAM_GUIDES, clock, pass_seed, render_pass
 from .load import InputError
@@ -32,7 +34,7 @@ class Guides:
 def require() -> None:
     """Raise :class:`InputError` where the denoiser is not installed."""
     try:
-        import mitsuba_oidn  # noqa: F401
+        oidn.denoiser()
     except ImportError:
         raise InputError("--denoise needs Open Image Denoise; type: pip install 'mi_neural[denoise]'") from None
 
@@ -56,17 +58,12 @@ def render_guides(scene, seed: int = 0, sensor: int = 0) -> Guides:
 def denoise(rgb: np.ndarray, guides: Guides) -> tuple[np.ndarray, float]:
     """Denoised linear RGB, float32 of shape (height, width, 3), and the seconds it took.
 
-    Non-finite pixels go in as black. Raises :class:`InputError` without the package, ``ValueError`` for unequal shapes.
+    Raises :class:`InputError` without the package, ``ValueError`` for unequal shapes.
     """
     require()
-    import mitsuba_oidn
-
-    if rgb.shape != guides.albedo.shape:
-        raise ValueError(f"the image has shape {rgb.shape}, the guides {guides.albedo.shape}: they must be equal")
-    noisy = np.ascontiguousarray(np.nan_to_num(rgb, nan=0.0, posinf=0.0, neginf=0.0), np.float32)
     start = clock()
-    clean = mitsuba_oidn.denoise(noisy, albedo=guides.albedo, normal=guides.normal, hdr=True)
-    return np.array(clean, np.float32), clock() - start
+    clean = oidn.denoise(rgb, guides.albedo, guides.normal)
+    return clean, clock() - start
 
 
 def warm_up(guides: Guides) -> float:

@@ -29,7 +29,9 @@ from statistics import median
 
 import numpy as np
 
-from . import budget, denoise, memory, metrics, split
+from mi_neural.image import metrics
+
+from . import budget, denoise, memory, split
 from .budget import Rendered
 from .load import IntegratorSpec, LoadedScene, build_integrator, format_value
 from .reference import Reference
@@ -132,7 +134,7 @@ class Bench:
     """Measures integrators on one scene against one reference; hand each finished picture to `on_picture`.
 
     Ctrl-C: the rendering under way is finished early, its row is marked, and ``KeyboardInterrupt`` is raised after it.
-    What `kept` holds (a :class:`~mi_neural.measure.kept.Kept`) is not measured again.
+    What `kept` holds (a :class:`~mi_neural.bench.kept.Kept`) is not measured again.
     """
 
     def __init__(

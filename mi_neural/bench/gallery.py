@@ -1,4 +1,4 @@
-"""A gallery out of what `mi-neural compare` and `sequence` wrote: ``python -m mi_neural.measure.gallery DIR``.
+"""A gallery out of what `mi-neural compare` and `sequence` wrote: ``python -m mi_neural.bench.gallery DIR``.
 
 Every folder in DIR that holds a `results.json` becomes a section of `DIR/index.html`: pictures, error maps, what each
 cost, and the command that makes it; the frames of a sequence become an animation. ``--compact FILE.webp`` also writes
@@ -16,7 +16,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from . import exr, metrics
+from mi_neural.image import exr, metrics
+
 from .load import InputError
 from .montage import montage
 from .page import flip_colours

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mi_neural.image.moments import Accumulator
+
 from .load import split_channels
 
 #: Called with (done, total), in samples, frames or seconds.
@@ -59,40 +61,6 @@ class Rendered:
     statistics: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
     problem: str = ""
-
-
-class Accumulator:
-    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted."""
-
-    def __init__(self) -> None:
-        self.total: np.ndarray | None = None
-        self.weight: np.ndarray | None = None
-        self.spp = 0
-        self.nonfinite = 0
-
-    def add(self, image: np.ndarray, spp: int) -> None:
-        """Add a developed film of shape (height, width, channels) that was rendered with `spp` samples a pixel."""
-        image = np.asarray(image, np.float64)
-        if self.total is None:
-            self.total = np.zeros_like(image)
-            self.weight = np.zeros((*image.shape[:2], 1))
-        finite = np.isfinite(image).all(axis=-1, keepdims=True)
-        n_bad = finite.size - np.count_nonzero(finite)
-        self.total += spp * (np.where(finite, image, 0.0) if n_bad else image)
-        self.weight += spp * finite
-        self.nonfinite += n_bad
-        self.spp += spp
-
-    def replace(self, image: np.ndarray, spp: int) -> None:
-        """Add a film that already stands for all passes so far, `spp` more samples a pixel included."""
-        spp, nonfinite = spp + self.spp, self.nonfinite
-        self.__init__()
-        self.add(image, spp)
-        self.nonfinite += nonfinite
-
-    def mean(self) -> np.ndarray:
-        """The mean so far, float32; black where no pass was finite."""
-        return (self.total / np.maximum(self.weight, 1.0)).astype(np.float32)
 
 
 # ------------------------------------------------------------------------------------------------------------------

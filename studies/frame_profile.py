@@ -1,6 +1,6 @@
-"""What a frame costs, and how near that is to what the cores can do: ``python -m mi_neural.measure.profile SCENE``.
+"""What a frame costs, and how near that is to what the cores can do: ``python studies/frame_profile.py SCENE``.
 
-frame         wall time of a frame of a trained cache by :mod:`.split`: train, query, trace, film, Python
+frame         wall time of a frame of a trained cache by :mod:`mi_neural.bench.split`: train, query, trace, film, Python
 training      one training frame by kernels, medians: `records` (tracing them: kernels as wide as there are paths),
               `network` (encoding, forward, backward: as wide as there are records), `products` (weight gradients),
               `optimiser` (all else: Adam, averages, sums), `python` (wall time in which no kernel runs)
@@ -26,9 +26,9 @@ from statistics import median
 
 import numpy as np
 
+from mi_neural.bench import budget, environment, load, memory, split, terminal
+from mi_neural.image import exr
 from mi_neural.render.frozen import undisturbed
-
-from . import budget, environment, exr, load, memory, split
 
 #: Frames that are measured, after those in which functions are recorded.
 FRAMES, WARM_FRAMES = 20, 3
@@ -196,7 +196,7 @@ def table(found: dict) -> list[tuple[str, str]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m mi_neural.measure.profile", description=__doc__,
+    parser = argparse.ArgumentParser(prog="python studies/frame_profile.py", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("scene", help="scene file or shipped scene")
     parser.add_argument("-i", "--integrator", default="nirc", help="TYPE[:K=V,...]")
@@ -208,8 +208,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")
     options = parser.parse_args(arguments)
-
-    from . import terminal
 
     try:
         terminal.set_variant(options.variant)
@@ -234,6 +232,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    import mi_neural  # noqa: F401 (first: it chooses the LLVM library)
-
     sys.exit(main())

@@ -1,4 +1,4 @@
-"""Where the time of a frame goes: ``python -m mi_neural.measure.split SCENE -i nirc``.
+"""Where the time of a frame goes: ``python -m mi_neural.bench.split SCENE -i nirc``.
 
 Frames of a trained cache, with Dr.Jit's kernel history, which times each kernel by itself; medians over a few frames.
 
@@ -119,7 +119,7 @@ def ablated_query(scene, spec: load.IntegratorSpec, keys: dict, integrator, spp:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m mi_neural.measure.split", description=__doc__,
+    parser = argparse.ArgumentParser(prog="python -m mi_neural.bench.split", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("scene", help="scene file or shipped scene")
     parser.add_argument("-i", "--integrator", action="append", required=True, help="TYPE[:K=V,...], repeatable")
@@ -154,6 +154,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    import mi_neural  # noqa: F401 (first: it chooses the LLVM library)
-
     sys.exit(main())

@@ -1,4 +1,4 @@
-"""How cost grows: ``python -m mi_neural.measure.scaling SCENE -i nirc --over pixels -o DIR``.
+"""How cost grows: ``python studies/scaling.py SCENE -i nirc --over pixels -o DIR``.
 
 One quantity is varied, everything else stays as it is; at each value an integrator is built, warmed up and trained by
 some frames, and then the medians over a few frames are taken of
@@ -27,7 +27,8 @@ from statistics import median
 
 import numpy as np
 
-from . import budget, environment, exr, load, memory
+from mi_neural.bench import budget, environment, load, memory, terminal
+from mi_neural.image import exr
 
 #: Values that are varied by default.
 DEFAULTS = {
@@ -68,9 +69,7 @@ class Setting:
 
 
 def settings(over: str, values: tuple[str, ...], scene: str, size: tuple[int, int] | None, spp: int) -> list[Setting]:
-    """The settings of a sweep. Raises :class:`~mi_neural.measure.load.InputError` for values that cannot be read."""
-    from . import terminal
-
+    """The settings of a sweep. Raises :class:`~mi_neural.bench.load.InputError` for values that cannot be read."""
     if over == "pixels":
         return [Setting(v, scene, terminal.parse_size(v), spp, {}) for v in values]
     if over == "samples":
@@ -220,7 +219,7 @@ def plot(found: dict[str, list[Point]], title: str):
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m mi_neural.measure.scaling", description=__doc__,
+    parser = argparse.ArgumentParser(prog="python studies/scaling.py", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("scene", help="scene file or shipped scene; `lights` for --over lights")
     parser.add_argument("-i", "--integrator", action="append", required=True, help="TYPE[:K=V,...], repeatable")
@@ -234,8 +233,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("-o", "--output", type=Path, help="folder for results.json and scaling.png")
     options = parser.parse_args(arguments)
-
-    from . import terminal
 
     over, _, values = options.over.partition("=")
     found: dict[str, list[Point]] = {}
@@ -272,6 +269,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    import mi_neural  # noqa: F401 (first: it chooses the LLVM library)
-
     sys.exit(main())

@@ -3,12 +3,12 @@
     dask scheduler                                  # on one machine; says its address
     dask worker tcp://HOST:8786 --nthreads 8        # on each machine, with mi_neural installed
 
-    from mi_neural.measure import cluster
+    from mi_neural.bench import cluster
     image = cluster.render("scene.xml", "nirc", spp=4096, client="tcp://HOST:8786")
 
 A worker process renders with `--nthreads` threads and has one job at a time. The cache is trained here, once, and its
 file's bytes go to the workers, which train no more. An image is divided into passes as one process would divide it,
-with the same random numbers, and merged by sample count (:class:`~mi_neural.measure.moments.Moments`): it is the image
+with the same random numbers, and merged by sample count (:class:`~mi_neural.image.moments.Moments`): it is the image
 of one process up to the order of summation, except for what a worker measures or learns by itself (a light sampler's
 visibility, the pilot of `nirc_two_level`), which changes noise and no mean.
 
@@ -33,9 +33,11 @@ from pathlib import Path
 
 import numpy as np
 
-from . import benchmark, budget, environment, exr, jobs, sequence
+from mi_neural.image import exr
+from mi_neural.image.moments import Moments
+
+from . import benchmark, budget, environment, jobs, sequence
 from .load import InputError, LoadedScene, load_scene, one_line, parse_integrator, split_channels
-from .moments import Moments
 
 #: Fewest passes of an image, as far as it has samples: their spread says what the variance is.
 LEAST_PASSES = 16
@@ -456,7 +458,7 @@ def render(
     patience    seconds to wait for a worker where there is none (any more)
     progress    called with (samples a pixel done, all)
 
-    Returns a :class:`~mi_neural.measure.budget.Rendered`: `rgb` of shape (height, width, 3), and the variance of that
+    Returns a :class:`~mi_neural.bench.budget.Rendered`: `rgb` of shape (height, width, 3), and the variance of that
     mean in ``channels["variance.R"]``, `G`, `B`. Raises :class:`InputError` and :class:`ClusterError`.
     """
     import mitsuba as mi

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_neural.image.metrics import bias_and_variance, block_means, relative_squared_errors
+
 from .benchmark import Row
-from .metrics import bias_and_variance, block_means, relative_squared_errors
 from .reference import Reference
 
 LEVEL = 0.95

@@ -1,4 +1,4 @@
-"""How many rays the caches save at equal bias: ``python -m mi_neural.measure.path_lengths SCENE --reference R -o DIR``.
+"""How many rays the caches save at equal bias: ``python studies/path_lengths.py SCENE --reference R -o DIR``.
 
 Both caches are trained once; then images are made for a row of spread thresholds, from stopping as early as possible to
 hardly ever, and the squared bias of each is drawn over its mean path length, as on the project page of the incident
@@ -20,9 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from . import environment, exr, load
-from .metrics import bias_and_variance
-from .reference import Reference, load_reference
+from mi_neural.bench import environment, load
+from mi_neural.bench.reference import Reference, load_reference
+from mi_neural.image import exr
+from mi_neural.image.metrics import bias_and_variance
 
 #: Constants c of the spread test a > c a_0.
 THRESHOLDS = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
@@ -117,7 +118,7 @@ def plot(points: list[Point], title: str):
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m mi_neural.measure.path_lengths", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python studies/path_lengths.py", description=__doc__)
     parser.add_argument("scene", help="scene file or shipped scene")
     parser.add_argument("--reference", required=True, help="EXR, of the size that is rendered")
     parser.add_argument("--frames", type=int, default=300, help="training frames")
@@ -163,6 +164,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    import mi_neural  # noqa: F401 (first: it chooses the LLVM library)
-
     sys.exit(main())

@@ -14,7 +14,7 @@ _SCENE = re.compile(r"<scene\b")
 def scenes_in(folder: Path) -> list[Path]:
     """All scene files in a folder and below it, in alphabetical order, without those that others include.
 
-    Raises :class:`~mi_neural.measure.load.InputError` where there are none.
+    Raises :class:`~mi_neural.bench.load.InputError` where there are none.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}: --scenes takes one that holds scene files")

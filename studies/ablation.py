@@ -1,4 +1,4 @@
-"""What a plan saves: ``python -m mi_neural.measure.ablation SCENE ... -o DIR``.
+"""What a plan saves: ``python studies/ablation.py SCENE ... -o DIR``.
 
 Each scene is rendered by one integrator twice over, with the parts that its plan says and with everything built
 (``plan=everything``): frames of a trained cache, training step included, in turn, so that a change in the machine's
@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from . import budget, environment, exr, load, metrics
-from . import reference as references
-from .reference import Reference
-from .repeats import half_width
+from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.bench import reference as references
+from mi_neural.bench.reference import Reference
+from mi_neural.bench.repeats import half_width
+from mi_neural.image import exr, metrics
 
 #: What is compared, and in which mode of the plan each is.
 PLANNED, EVERYTHING, EQUAL_TIME = "planned", "everything", "planned, equal time"
@@ -174,7 +175,7 @@ def markdown(results: list[Result]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m mi_neural.measure.ablation", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python studies/ablation.py", description=__doc__)
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="scene file or shipped scene")
     parser.add_argument("-i", "--integrator", default="nirc", help="TYPE[:K=V,...] of a cached integrator")
     parser.add_argument("--size", default="160x90")
@@ -192,8 +193,6 @@ def main(arguments: list[str] | None = None) -> int:
     import mitsuba as mi
 
     mi.set_variant(options.variant)
-    from . import terminal
-
     options.output.mkdir(parents=True, exist_ok=True)
     results: list[Result] = []
     try:
@@ -220,6 +219,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    import mi_neural  # noqa: F401 (first: it chooses the LLVM library)
-
     sys.exit(main())

@@ -2,7 +2,7 @@
 
 A job is plain data, and its result follows from it and from the bytes that come with it (a cache file). The process
 that runs it keeps the last scene and integrator, for jobs that follow. Here is nothing of Dask, which only hands jobs
-out (:mod:`mi_neural.measure.cluster`): in the process that made it, a job runs the same way.
+out (:mod:`mi_neural.bench.cluster`): in the process that made it, a job runs the same way.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
+from mi_neural.image.moments import Moments
+
 from . import benchmark, budget, changes, denoise, environment
 from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, find_scene, load_scene
-from .moments import Moments
 from .reference import Reference
 from .sequence import STREAM_FRAMES, Sequence
 

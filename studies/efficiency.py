@@ -1,4 +1,4 @@
-"""Efficiency of unbiased integrators, 1 / (variance x time): ``python -m mi_neural.measure.efficiency SCENE -i path``.
+"""Efficiency of unbiased integrators, 1 / (variance x time): ``python studies/efficiency.py SCENE -i path``.
 
 Independent images of a few samples a pixel are rendered in turn by each integrator, so that a change in the machine's
 load meets all of them. The variance is that of one camera sample, relative to the squared luminance of its pixel as in
@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from . import budget, environment, exr, load
-from .metrics import TRIM_FRACTION
+from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.image import exr
+from mi_neural.image.metrics import TRIM_FRACTION
 
 #: Added to the squared luminance of a pixel, over the squared mean luminance: as in relMSE.
 EPSILON = 1e-2
@@ -70,7 +71,7 @@ def measure(scene, integrators: dict, spp: int, rounds: int, frames: int) -> lis
 
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m mi_neural.measure.efficiency", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python studies/efficiency.py", description=__doc__)
     parser.add_argument("scene", help="scene file or shipped scene")
     parser.add_argument("-i", "--integrator", action="append", required=True, help="TYPE[:K=V,...], repeatable")
     parser.add_argument("--size", default="128x72")
@@ -85,8 +86,6 @@ def main(arguments: list[str] | None = None) -> int:
     import mitsuba as mi
 
     mi.set_variant(options.variant)
-    from . import terminal
-
     try:
         loaded = load.load_scene(options.scene, size=terminal.parse_size(options.size),
                                  parameters=terminal.parse_define(options.D))  # fmt: skip
@@ -109,6 +108,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    import mi_neural  # noqa: F401 (first: it chooses the LLVM library)
-
     sys.exit(main())

@@ -16,7 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from . import exr, metrics, report
+from mi_neural.image import exr, metrics
+
+from . import report
 from .benchmark import plain
 from .load import LoadedScene
 from .page import flip_colours

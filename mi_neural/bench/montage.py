@@ -1,4 +1,4 @@
-"""Pictures side by side: ``python -m mi_neural.measure.montage OUT.png A.png B.png ...`` (two to a row)."""
+"""Pictures side by side: ``python -m mi_neural.bench.montage OUT.png A.png B.png ...`` (two to a row)."""
 
 from __future__ import annotations
 

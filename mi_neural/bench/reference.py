@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from . import exr
+from mi_neural.image import exr
+from mi_neural.image.metrics import block_means, count_nonfinite, relative_squared_errors
+
 from .budget import STREAM_REFERENCE, Progress, clock, pass_seed, pixels, render_pass
 from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, split_channels
-from .metrics import block_means, count_nonfinite, relative_squared_errors
 
 #: Passes hold about this many samples and at most MAX_PASS_SPP a pixel: many passes, or there is no variance to
 #: estimate.

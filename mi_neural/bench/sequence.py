@@ -22,7 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from . import benchmark, budget, changes, denoise, exr, metrics
+from mi_neural.image import exr, metrics
+
+from . import benchmark, budget, changes, denoise
 from . import reference as references
 from .benchmark import Case, plain
 from .budget import clock

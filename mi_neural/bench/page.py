@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from . import curves, exr
+from mi_neural.image import exr
+
+from . import curves
 from .benchmark import Picture
 from .reference import Reference
 from .report import Report, SceneResult, html_table, name_of, number, split_table, summary, table
