@@ -1,6 +1,6 @@
-"""Fit the table of linearly transformed cosines for GGX and write `ltc_ggx.npz` beside this file.
+"""Fit the table of linearly transformed cosines for GGX and write `ltc_ggx.npz` in the folder of `mi_neural.lights`.
 
-``python -m mi_neural.lights.fit_ltc`` (needs SciPy; half a minute on one core). Heitz, Dupuy, Hill, Neubelt 2016,
+``python studies/fit_ltc.py`` (needs SciPy; half a minute on one core). Heitz, Dupuy, Hill, Neubelt 2016,
 "Real-time polygonal-light shading with linearly transformed cosines", section 5.
 
 The BRDF is isotropic GGX with Smith's height-correlated masking and Fresnel = 1, times the cosine of the outgoing
@@ -12,24 +12,19 @@ L3 error 0.15 against 0.19 at α = 0.5, θ = 60°; 0.15 against 0.28 at α = 0.1
 are good (0.03 against 0.01 at α = 0.1, θ = 45°). In return M keeps the horizon: no light is lost below it, and whatever
 is above it reflects more than nothing.
 
-Stored are the numbers of O(1) that `entries` turns into m11, m22 and m13.
+Stored are the numbers of O(1) that `mi_neural.lights.ltc.entries` turns into m11, m22 and m13.
 """
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import numpy as np
 
-FILE = Path(__file__).with_name("ltc_ggx.npz")
+from mi_neural.lights.ltc import ALPHA_MIN, COS_MIN, FILE, entries
 
 #: Cells along each axis.
 SIZE = 64
-#: Smallest roughness of the table; sharper lobes are taken to be as sharp.
-ALPHA_MIN = 1e-3
-#: Smallest cosine of the view direction.
-COS_MIN = 1e-2
 
 
 def roughness(size: int = SIZE) -> np.ndarray:
@@ -40,17 +35,6 @@ def roughness(size: int = SIZE) -> np.ndarray:
 def cosines(size: int = SIZE) -> np.ndarray:
     """cos θ of each column: uniform in sqrt(1 - cos θ), shape (size,)."""
     return 1 - np.linspace(0, np.sqrt(1 - COS_MIN), size) ** 2
-
-
-def entries(q, alpha, cos_theta):
-    """(m11, m22, m13) from the stored (q11, q22, q13): the limits of sharp lobes and of grazing views factored out.
-
-    Sharp lobes (α -> 0) have ``2α/cos²θ, 2α, -tan θ``, that is q = (2, 2, 1) at every θ; towards grazing views cos θ
-    ceases to matter where it falls below α.
-    """
-    wide = cos_theta * cos_theta + alpha * alpha
-    tangent = ((1 - cos_theta * cos_theta) / wide) ** 0.5
-    return q[0] * alpha / wide, q[1] * alpha, -q[2] * tangent
 
 
 def view(cos_theta: float) -> np.ndarray:
