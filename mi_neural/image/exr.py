@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 import tempfile
-import zlib
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -146,26 +144,15 @@ def to_srgb8(rgb: np.ndarray, exposure: float = 0.0) -> np.ndarray:
 
 
 def png_bytes(rgb8: np.ndarray) -> bytes:
-    """Encode uint8 RGB of shape (height, width, 3) as PNG, each row as its difference from the row above."""
+    """Encode uint8 RGB of shape (height, width, 3) as PNG."""
+    import mitsuba as mi  # its Bitmap is the same in all variants, and there before one is chosen
+
     rgb8 = np.asarray(rgb8)
     if rgb8.dtype != np.uint8 or rgb8.ndim != 3 or rgb8.shape[2] != 3:
         raise ValueError(f"expected uint8 of shape (height, width, 3), got {rgb8.dtype} of shape {rgb8.shape}")
-    height, width = rgb8.shape[:2]
-    rows = rgb8.reshape(height, width * 3)
-    above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
-    filtered = np.hstack([np.full((height, 1), 2, np.uint8), rows - above])  # 2: filter "up", modulo 256
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    return b"".join(
-        (
-            b"\x89PNG\r\n\x1a\n",
-            chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
-            chunk(b"IDAT", zlib.compress(filtered.tobytes(), 6)),
-            chunk(b"IEND", b""),
-        )
-    )
+    stream = mi.MemoryStream()
+    mi.Bitmap(np.ascontiguousarray(rgb8)).write(stream, mi.Bitmap.FileFormat.PNG)
+    return stream.raw_buffer()
 
 
 def write_png(path: str | os.PathLike, rgb: np.ndarray, exposure: float = 0.0) -> None:
