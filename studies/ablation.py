@@ -1,8 +1,8 @@
 """What a plan saves: ``python studies/ablation.py SCENE ... -o DIR``.
 
-Each scene is rendered by one integrator twice over, with the parts that its plan says and with everything built
+Each scene is rendered by one integrator twice over, with the parts that its plan chooses and with everything built
 (``plan=everything``): frames of a trained cache, training step included, in turn, so that a change in the machine's
-load meets both. The training is repeated with other seeds. Reported are the time of a frame and its error at equal
+load affects both. The training is repeated with other seeds. Reported are the time of a frame and its error at equal
 samples, and the error of the planned one with as many samples as fit into the time of the other. Intervals are of 95 %,
 over the repeats, by Student's t; of ratios of times and of differences, those within a repeat.
 """
@@ -94,8 +94,8 @@ def measure(
         return budget.clock() - start, np.asarray(image[..., :3], np.float64)
 
     def judged(images_) -> np.ndarray:
-        known = reference.rgb, reference.variance, exposures
-        found = [metrics.errors(metrics.block_means(image, reference.rgb.shape), *known)[0] for image in images_]
+        target = reference.rgb, reference.variance, exposures
+        found = [metrics.errors(metrics.block_means(image, reference.rgb.shape), *target)[0] for image in images_]
         return np.mean([(e.relmse_trimmed, e.flip) for e in found], axis=0)
 
     for r in range(repeats):
@@ -145,10 +145,10 @@ def _begin_anew(integrator, seed: int) -> None:
             part.cache.seed = seed
 
 
-def reference_of(loaded: load.LoadedScene, folder: Path, spp: int, given: str | None, progress=None) -> Reference:
-    """The reference `given`, or the one beside the scene, or one of `spp` samples, rendered and kept in `folder`."""
-    if given := given or references.beside(loaded.path, loaded.size, loaded.box_filter):
-        return references.of_film(given, loaded)
+def reference_of(loaded: load.LoadedScene, folder: Path, spp: int, path: str | None, progress=None) -> Reference:
+    """The reference in the file `path`, or the one beside the scene, or one of `spp` samples, kept in `folder`."""
+    if path := path or references.beside(loaded.path, loaded.size, loaded.box_filter):
+        return references.of_film(path, loaded)
     width, height = loaded.size
     path = folder / f"reference_{loaded.name}_{width}x{height}_{spp}.exr"
     if not path.is_file():
@@ -162,8 +162,8 @@ def reference_of(loaded: load.LoadedScene, folder: Path, spp: int, given: str | 
             if progress:
                 progress(k + 1, n)
         variance = np.var(images, axis=0, ddof=1) / n
-        facts = {"integrator": REFERENCE, "spp": str(max(1, spp // n) * n)}
-        exr.write(path, np.mean(images, axis=0), exr.layer_channels("variance", variance), facts)
+        metadata = {"integrator": REFERENCE, "spp": str(max(1, spp // n) * n)}
+        exr.write(path, np.mean(images, axis=0), exr.layer_channels("variance", variance), metadata)
     return references.load_reference(path, loaded.size)
 
 
@@ -197,10 +197,10 @@ def main(arguments: list[str] | None = None) -> int:
     results: list[Result] = []
     try:
         spec = load.parse_integrator(options.integrator)
-        given = terminal.parse_define(options.reference)
+        named = terminal.parse_define(options.reference)
         for name in options.scenes:
             loaded = load.load_scene(name, terminal.parse_size(options.size), terminal.parse_define(options.D))
-            reference = reference_of(loaded, options.output, options.reference_spp, given.get(loaded.name))
+            reference = reference_of(loaded, options.output, options.reference_spp, named.get(loaded.name))
             results.append(measure(
                 loaded, spec, reference, frames=options.frames, repeats=options.repeats, spp=options.spp,
                 images=options.images,

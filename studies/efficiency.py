@@ -1,9 +1,9 @@
 """Efficiency of unbiased integrators, 1 / (variance x time): ``python studies/efficiency.py SCENE -i path``.
 
 Independent images of a few samples a pixel are rendered in turn by each integrator, so that a change in the machine's
-load meets all of them. The variance is that of one camera sample, relative to the squared luminance of its pixel as in
-relMSE, averaged over pixels and channels, plain and without the largest 0.1 %; the time is the median of the render
-calls, over their samples. Integrators that learn are trained before. The first one given has efficiency 1.
+load affects all of them. The variance is that of one camera sample, relative to the squared luminance of its pixel as
+in relMSE, averaged over pixels and channels, plain and without the largest 0.1 %; the time is the median of the render
+calls, over their samples. Integrators that learn are trained before. The first integrator has efficiency 1.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def relative_variance(images: np.ndarray, spp: int) -> tuple[float, float]:
 
 
 def measure(scene, integrators: dict, spp: int, rounds: int, frames: int) -> list[dict]:
-    """A row of facts for each of the `integrators` (label -> integrator), trained for `frames` frames before."""
+    """A row of results for each of the `integrators` (label -> integrator), trained for `frames` frames before."""
     for integrator in integrators.values():
         budget.warm_up(scene, integrator, [spp])
         budget.reset(integrator)

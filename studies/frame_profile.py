@@ -56,7 +56,7 @@ def blas_flops(rows: int, inner: int, columns: int) -> float:
 
 
 def trained_network(integrator):
-    """The averaged weights of what the integrator's cache asks; None if it has none."""
+    """The averaged weights of the network that the integrator's cache queries; None if it has none."""
     field = getattr(getattr(integrator, "cache", None), "field", None)
     return getattr(getattr(field, "incident", field), "averaged", None)
 
@@ -142,14 +142,14 @@ def first_image(scene: str, integrator: str, options: list[str]) -> dict[str, di
     """Seconds until ``mi-neural render`` has a first image on disk, and until it ends: ``cold`` and ``warm``."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        facts = Path(folder) / "facts.json"
+        written = Path(folder) / "row.json"
         command = [sys.executable, "-m", "mi_neural.cli", "render", scene, "-i", integrator, "--spp", "1", *options,
-                   "-o", str(Path(folder) / "image.exr"), "--json", str(facts)]  # fmt: skip
+                   "-o", str(Path(folder) / "image.exr"), "--json", str(written)]  # fmt: skip
         kernels = {**os.environ, "DRJIT_CACHE_DIR": str(Path(folder) / "kernels")}
         for name in ("cold", "warm"):
             start = budget.clock()
             subprocess.run(command, check=True, env=kernels, capture_output=True)
-            row = json.loads(facts.read_text())
+            row = json.loads(written.read_text())
             found[name] = {"first": row["seconds_to_first_image"], "done": budget.clock() - start,
                            "compile": row["seconds_compile"], "train": row["seconds_train"]}  # fmt: skip
     return found
@@ -226,8 +226,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name, value in table(found):
         print(f"{name:<28}{value}", flush=True)
     if options.output:
-        facts = {"scene": loaded.name, "size": list(loaded.size), "integrator": spec.label, **found}
-        exr.write_text(options.output, json.dumps({**facts, "environment": environment.describe()}, indent=1) + "\n")
+        row = {"scene": loaded.name, "size": list(loaded.size), "integrator": spec.label, **found}
+        exr.write_text(options.output, json.dumps({**row, "environment": environment.describe()}, indent=1) + "\n")
     return 0
 
 

@@ -5,7 +5,7 @@ hardly ever, and the squared bias of each is drawn over its mean path length, as
 cache (Dereviannykh et al. 2025). The length is the number of rays that carry reflected light to the first surface that
 is neither mirror nor glass (channel ``depth``, less what ``nrc`` has with c = 0). Rays that find direct light alone
 (shadow rays, the BSDF ray that shares the work with them) do not count: both integrators trace them at each vertex that
-does not ask the outgoing cache.
+does not query the outgoing cache.
 """
 
 from __future__ import annotations

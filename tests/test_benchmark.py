@@ -407,9 +407,9 @@ def test_rows_hold_what_the_contract_names(measured):
     pictures, _ = measured
     rows = [p.row for p in pictures]
     for row in rows:
-        facts = json.loads(json.dumps(row.to_json(), allow_nan=False))
-        assert set(KEYS) <= facts.keys()
-        assert facts["parameters"]["max_depth"] == 4
+        entry = json.loads(json.dumps(row.to_json(), allow_nan=False))
+        assert set(KEYS) <= entry.keys()
+        assert entry["parameters"]["max_depth"] == 4
         assert row.mode in benchmark.WITHOUT_PICTURE or (row.relmse > 0.0 and row.flip > 0.0)
         assert row.environment == {"cores": 1}
         assert row.seconds_total == row.seconds_train + row.seconds_render + row.seconds_denoise
@@ -454,7 +454,7 @@ def test_report_is_one_file_that_loads_nothing(measured, tmp_path):
     pictures, ref = measured
     rows = [p.row for p in pictures]
     entries = [page.reference_entry(ref, 0.0), *(page.entry(p, 0.0) for p in pictures if p.rgb is not None)]
-    scene = report.SceneResult("a<b", SIZE, rows, repeats.group(rows), ref.facts(), ["a & b"], entries)
+    scene = report.SceneResult("a<b", SIZE, rows, repeats.group(rows), ref.to_json(), ["a & b"], entries)
     suite.write(report.Report("mi-neural compare", {"cores": 1}, [scene], ["c & d"]), tmp_path)
     text = (tmp_path / "report.html").read_text()
     assert text.count("data:image/png;base64,") == 2 * len(entries) - 1

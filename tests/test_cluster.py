@@ -328,7 +328,7 @@ def test_error_of_a_worker_comes_back_as_one_line_that_names_it(address):
 
 
 WRONG = {
-    "versions": ({"versions": jobs.versions() | {"mitsuba": "1.0"}}, "it has mitsuba 3.* asks has 1.0: install"),
+    "versions": ({"versions": jobs.versions() | {"mitsuba": "1.0"}}, "it has mitsuba 3.* sent the job has 1.0: "),
     "scene": ({"scene": "/nowhere/a.xml"}, "it sees no file /nowhere/a.xml: put scene, meshes and textures where all"),
     "digest": ({"digest": "0"}, r"its .*cornell_box.xml, or a file that it names, is not the one here"),
 }

@@ -150,6 +150,6 @@ def test_peak_is_counted_anew():
     assert memory.peak_mib() < before + 64
 
 
-def test_system_that_does_not_tell(monkeypatch, tmp_path):
+def test_system_that_does_not_count_it(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "none")
     assert memory.start() is False and memory.peak_mib() is None

@@ -417,9 +417,9 @@ def frames_of(
 
     def render(case: benchmark.Case, frames: range) -> Iterator[sequence.Frame]:
         setup = jobs.Setup.of(loaded, case, size, merge=False)
-        facts = (setup, tuple(texts), over_time.frames, over_time.change_at)
+        of_all = (setup, tuple(texts), over_time.frames, over_time.change_at)
         learned = jobs.cache_bytes(case.integrator)
-        of_frames = [(jobs.Frame(*facts, frame, plan.spp, plan.seed), learned) for frame in frames]
+        of_frames = [(jobs.Frame(*of_all, frame, plan.spp, plan.seed), learned) for frame in frames]
         early: dict[int, sequence.Frame] = {}
         following = 0
         for index, answer in workers.run(of_frames):

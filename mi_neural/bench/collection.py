@@ -31,7 +31,7 @@ def scenes_in(folder: Path) -> list[Path]:
 
 
 def choose(names: list[str] | None, folder: Path | None) -> list[Path]:
-    """The scene files that were asked for by name or as a folder, each once."""
+    """The scene files that are named or lie in a folder that is named, each once."""
     files = [find_scene(name) for name in names or []] + (scenes_in(folder) if folder is not None else [])
     if not files:
         raise InputError("no scene: give names or files, or --scenes DIR for all in a folder")

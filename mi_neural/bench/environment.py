@@ -42,7 +42,7 @@ def cores() -> int:
 
 
 def processor() -> str:
-    """The processor's name as its maker writes it, where the system tells."""
+    """The processor's name as its maker writes it; of other systems, what Python reports."""
     if sys.platform == "linux":
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -51,7 +51,7 @@ def processor() -> str:
 
 
 def seconds_since_start() -> float:
-    """Seconds since this process was started; where the system does not tell, since this module was imported."""
+    """Seconds since this process was started; where the system does not keep that, since this module was imported."""
     try:
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         started = int(fields[19]) / os.sysconf("SC_CLK_TCK")  # field 22: clock ticks after the machine's start

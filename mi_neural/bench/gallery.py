@@ -120,8 +120,8 @@ def _caption(row: dict) -> str:
 
 def command_of(row: dict, command: str) -> str:
     """The command that renders such a picture as that of a row which `command` made."""
-    given = [word for word in shlex.split(command)[2:] if Path(word).stem == row["scene"]]
-    words = ["mi-neural", "render", *(given[:1] or [row["scene"]]), "-i", row["label"]]
+    named = [word for word in shlex.split(command)[2:] if Path(word).stem == row["scene"]]
+    words = ["mi-neural", "render", *(named[:1] or [row["scene"]]), "-i", row["label"]]
     width, height = row["size"]
     words += [*_defines(command), "--size", f"{width}x{height}"]
     words += ["--pretrain", str(row["pretrain_frames"])] if row["pretrain_frames"] else []

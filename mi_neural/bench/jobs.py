@@ -1,4 +1,4 @@
-"""What another process is asked to do: a part of an image, a frame of a sequence, the rows of one case.
+"""Jobs for another process: a part of an image, a frame of a sequence, the rows of one case.
 
 A job is plain data, and its result follows from it and from the bytes that come with it (a cache file). The process
 that runs it keeps the last scene and integrator, for jobs that follow. Here is nothing of Dask, which only hands jobs
@@ -87,11 +87,12 @@ class Setup:
         return cls(name, loaded.digest, size, loaded.parameters, merge, case.spec, case.keys, own, mi.variant())
 
     def check(self) -> None:
-        """Raise :class:`InputError` where this process cannot give the results that are asked for."""
+        """Raise :class:`InputError` where this process cannot give the results of this setup."""
         for name, version in versions().items():
             if version != self.versions[name]:
                 raise InputError(
-                    f"it has {name} {version}, the process that asks has {self.versions[name]}: install the same there"
+                    f"it has {name} {version}, the process that sent the job has {self.versions[name]}: install the "
+                    "same there"
                 )
         try:
             find_scene(self.scene)
@@ -116,12 +117,12 @@ class Workbench:
         self.case: benchmark.Case | None = None
         self.cache: bytes | None = None
         self.sequence: Sequence | None = None
-        self.sequence_facts: tuple | None = None
+        self.sequence_key: tuple | None = None
 
     def ready(self, setup: Setup, fresh: bool = False) -> tuple[LoadedScene, benchmark.Case]:
         """Scene and integrator of a setup; those of the last one as far as they are the same.
 
-        `fresh`: an integrator that has not rendered, learned or been told not to learn anything.
+        `fresh`: an integrator that has neither rendered nor trained, and whose cache may train.
         """
         import mitsuba as mi
 
@@ -133,7 +134,7 @@ class Workbench:
         self.setup = self.of_scene = self.case = self.cache = None
         if not same_scene:
             # Gone before the next one is loaded: all emitters that are alive are compiled into every kernel
-            self.loaded = self.sequence = self.sequence_facts = None
+            self.loaded = self.sequence = self.sequence_key = None
         gc.collect()
         mi.set_variant(setup.variant)
         if not same_scene:
@@ -154,7 +155,7 @@ class Workbench:
     def learned(self, cache: bytes | None, over_time: Sequence | None = None) -> None:
         """Give the integrator the cache of those bytes, for good: it does not train any more.
 
-        It meets the scene in the state of frame 0 of `over_time`, as it did where it was trained.
+        It is bound to the scene in the state of frame 0 of `over_time`, as it did where it was trained.
         """
         integrator = self.case.integrator
         if hasattr(integrator, "freeze_cache"):
@@ -172,12 +173,12 @@ class Workbench:
 
     def changing(self, texts: tuple[str, ...], frames: int, change_at: int | None) -> Sequence:
         """The scene as a sequence of those changes."""
-        facts = (texts, frames, change_at)
-        if facts != self.sequence_facts:
+        key = (texts, frames, change_at)
+        if key != self.sequence_key:
             if self.sequence is not None:
                 self.sequence.restore()
             functions = changes.parse(list(texts), frames, change_at)
-            self.sequence, self.sequence_facts = Sequence(self.loaded.scene, functions, frames, change_at), facts
+            self.sequence, self.sequence_key = Sequence(self.loaded.scene, functions, frames, change_at), key
         return self.sequence
 
 
@@ -192,7 +193,7 @@ def cache_bytes(integrator) -> bytes | None:
         path = Path(folder) / "cache.npz"
         try:
             integrator.save_cache(str(path))
-        except RuntimeError:  # settings with which no cache is ever asked
+        except RuntimeError:  # settings with which no cache is ever queried
             return None
         return path.read_bytes()
 
@@ -254,9 +255,9 @@ class Measurement:
     setup: Setup
     plan: benchmark.Plan
 
-    def run(self, given: tuple[Reference, denoise.Guides | None]) -> list[benchmark.Picture]:
-        """The rows with their pictures; `given`: what all integrators are compared with, and denoised by."""
-        reference, guides = given
+    def run(self, shared: tuple[Reference, denoise.Guides | None]) -> list[benchmark.Picture]:
+        """The rows with their pictures; `shared`: what all integrators are compared with, and denoised by."""
+        reference, guides = shared
         if guides is not None:
             denoise.require()
         loaded, case = workbench.ready(self.setup, fresh=True)

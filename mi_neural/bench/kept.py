@@ -35,8 +35,8 @@ def settings_of(loaded, cases, plan, reference: Reference, denoised: bool) -> di
 class Kept:
     """Rows in `folder` that were measured with the same `settings`; those of others are forgotten.
 
-    A row is known by label, mode, budget, whether it was denoised, and repeat; those of a curve by their samples, too.
-    One that an interruption cut short does not count.
+    A row is identified by label, mode, budget, whether it was denoised, and repeat; those of a curve by their samples,
+    too. One that an interruption cut short does not count.
     """
 
     def __init__(self, folder: Path, settings: dict[str, object]) -> None:

@@ -24,7 +24,7 @@ def start() -> bool:
 
 def peak_mib() -> float | None:
     """Most memory in MiB that was resident since :func:`start`, the interpreter and the scene included; None where the
-    system does not tell. Graphics memory is not part of it."""
+    system does not count it. Graphics memory is not part of it."""
     try:
         lines = (_PROCESS / "status").read_text().splitlines()
     except OSError:

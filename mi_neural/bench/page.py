@@ -76,10 +76,10 @@ def entry(picture: Picture, exposure: float, exact: bool = True) -> dict[str, ob
 def reference_entry(reference: Reference, exposure: float, exact: bool = True) -> dict[str, object]:
     """The reference as the viewer's first picture."""
     spp, error = reference.metadata.get("spp"), reference.standard_error()
-    facts = [f"{spp} spp"] if spp else []
-    facts += [f"standard error of a pixel {100 * error:.2g} %"] if error is not None else []
+    caption = [f"{spp} spp"] if spp else []
+    caption += [f"standard error of a pixel {100 * error:.2g} %"] if error is not None else []
     image = data_url(exr.to_srgb8(reference.rgb, exposure), exact)
-    return {"name": "reference", "caption": ", ".join(facts), "image": image, "error": None}
+    return {"name": "reference", "caption": ", ".join(caption), "image": image, "error": None}
 
 
 def flip_colours(flip_map: np.ndarray) -> np.ndarray:

@@ -35,8 +35,8 @@ class Reference:
     """A reference image.
 
     rgb       float32, shape (height, width, 3)
-    variance  variance of `rgb` per value, same shape, or None where the file does not say
-    metadata  what the file says: integrator, max_depth, spp
+    variance  variance of `rgb` per value, same shape, or None where the file has none
+    metadata  attributes of the file: integrator, max_depth, spp
     path      the file
     seconds   time spent rendering it now; 0 where it was read
     """
@@ -68,8 +68,8 @@ class Reference:
         rgb = block_means(self.rgb, size[::-1]).astype(np.float32)
         return Reference(rgb, variance, self.metadata | {"averaged": scale}, self.path, self.seconds)
 
-    def facts(self) -> dict[str, object]:
-        """What results say about it."""
+    def to_json(self) -> dict[str, object]:
+        """Its entry in `results.json`."""
         return {
             **self.metadata, "path": str(self.path), "noise_relmse": self.noise_floor(),
             "standard_error": self.standard_error(), "variance_subtracted": self.variance is not None,
@@ -105,8 +105,8 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None, scaled
     variance = image.layer("variance")
     if variance is not None and not (np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise InputError(f"the reference {path} has negative or non-finite values in variance.*: render it anew")
-    known = Reference(image.rgb, variance, image.metadata, path)
-    return known.averaged(size) if size is not None and image.size[0] > size[0] else known
+    found = Reference(image.rgb, variance, image.metadata, path)
+    return found.averaged(size) if size is not None and image.size[0] > size[0] else found
 
 
 def scale_between(size: tuple[int, int], other: tuple[int, int]) -> int | None:
@@ -188,9 +188,9 @@ def reference_path(loaded: LoadedScene, folder: Path, state: str = "") -> Path:
     the scene is kept. The number of samples is not part of the name: it can grow."""
     import mitsuba as mi
 
-    facts = [loaded.digest, sorted(loaded.parameters.items()), loaded.size, sorted(loaded.carried.items())]
-    facts += [mi.__version__, *([state] if state else [])]
-    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:12]
+    inputs = [loaded.digest, sorted(loaded.parameters.items()), loaded.size, sorted(loaded.carried.items())]
+    inputs += [mi.__version__, *([state] if state else [])]
+    key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]
     return folder / f"reference_{loaded.name}_{key}.exr"
 
 

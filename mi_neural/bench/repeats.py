@@ -1,4 +1,4 @@
-"""What repeats say together: means with confidence intervals, bias and variance apart.
+"""Repeats taken together: means with confidence intervals, bias and variance apart.
 
 Intervals are Student's t of level 95 % for the mean of independent repeats. They hold for means of values that are
 about normal; of errors with rare outliers a few repeats see few, and the interval is then too narrow.
@@ -35,7 +35,7 @@ def half_width(values: Iterable[float]) -> float | None:
 
 @dataclass
 class Group:
-    """Rows that differ by their repeat alone, never none, and what their images say together.
+    """Rows that differ by their repeat alone, never none, and what follows from their images together.
 
     `squared_bias` and `variance` are those of one image, relative as in relMSE and trimmed alike; `squared_bias_error`
     is the first one's standard error: by the jackknife over the repeats, and of the reference as if its noise were
@@ -70,13 +70,13 @@ class Group:
         return half_width(self.values(name))
 
     def to_json(self) -> dict[str, object]:
-        """What `results.json` says of it."""
+        """Its entry in `results.json`."""
         label, mode, budget, denoised = self.key
-        facts = {"scene": self.first.scene, "label": label, "mode": mode, "budget_seconds": budget,
+        entry = {"scene": self.first.scene, "label": label, "mode": mode, "budget_seconds": budget,
                  "denoised": denoised, "repeats": len(self.rows), "level": LEVEL}  # fmt: skip
         for name in ("relmse_trimmed", "relmse", "flip", "flicker", "spp", "seconds_total", "peak_mib"):
-            facts |= {name: self.mean(name), f"{name}_half_width": self.half_width(name)}
-        return facts | {"squared_bias": self.squared_bias, "squared_bias_error": self.squared_bias_error,
+            entry |= {name: self.mean(name), f"{name}_half_width": self.half_width(name)}
+        return entry | {"squared_bias": self.squared_bias, "squared_bias_error": self.squared_bias_error,
                         "variance": self.variance}  # fmt: skip
 
 

@@ -42,7 +42,7 @@ NESTED = ("parameters", "statistics", "environment", "split", "size")
 
 @dataclass
 class SceneResult:
-    """What was found about one scene. `reference` are its facts, `entries` the pictures of :mod:`.page`; `notes` are
+    """Results of one scene. `reference`: :meth:`.Reference.to_json`; `entries`: the pictures of :mod:`.page`; `notes`:
     lines that a reader must know."""
 
     name: str

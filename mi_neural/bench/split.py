@@ -11,7 +11,7 @@ trace    all other kernels of the image: camera rays, materials, lights, splats
 python   wall time in which no kernel runs: Python, Dr.Jit's own work, launches; of the training step too
 
 The command also estimates queries by ablation, from what further `cache_samples` cost, which trace no rays: a query
-there includes the BSDF sample that it is asked for.
+there includes the BSDF sample that it needs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MORE_SAMPLES = 8
 
 @dataclass(frozen=True)
 class Split:
-    """Seconds of one frame of `spp` samples a pixel; `query` is None where nothing is asked or its cost is unknown.
+    """Seconds of one frame of `spp` samples a pixel; `query` is None without queries or where their cost is unknown.
 
     `total` is the wall time and the sum of the others.
     """

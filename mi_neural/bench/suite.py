@@ -52,10 +52,10 @@ class Settings:
 
 @dataclass
 class _Later:
-    """A case that the workers will measure, with what all cases of its scene are given, and what takes the rows."""
+    """A case that the workers will measure, with what all cases of its scene share, and what takes the rows."""
 
     job: jobs.Measurement
-    given: tuple[references.Reference, denoise.Guides | None]
+    shared: tuple[references.Reference, denoise.Guides | None]
     scene: str
     keep: Callable[[benchmark.Picture], None]
 
@@ -118,7 +118,7 @@ class Suite:
             return
         workers, todo = terminal.counted(self.workers.count(), "worker"), len(self._later)
         bar = self.bars(f"{terminal.counted(todo, 'case')} on {workers}")
-        for done, (index, answer) in enumerate(self.workers.map([(case.job, case.given) for case in self._later])):
+        for done, (index, answer) in enumerate(self.workers.map([(case.job, case.shared) for case in self._later])):
             case = self._later[index]
             if isinstance(answer, cluster.JobError):
                 if len(self.files) == 1:
@@ -149,11 +149,11 @@ class Suite:
     def _scene(self, file: Path, name: str, folder: Path) -> None:
         settings = self.settings
         folder.mkdir(parents=True, exist_ok=True)
-        given = settings.parameters
+        parameters = settings.parameters
         if len(self.files) > 1:
             has = load.scene_parameters(file)
-            given = {key: value for key, value in given.items() if key in has}
-        loaded = load.load_scene(str(file), settings.sizes, given)
+            parameters = {key: value for key, value in parameters.items() if key in has}
+        loaded = load.load_scene(str(file), settings.sizes, parameters)
         loaded.name = name
         cases = benchmark.make_cases(loaded, settings.specs, settings.keys)
         labels = ", ".join(spec.label for spec in settings.specs)
@@ -161,7 +161,7 @@ class Suite:
         reference = self._reference(loaded)
         notes = terminal.depth_notes(reference, loaded, cases)
         notes += terminal.notes(reference, settings.denoise, loaded.size)
-        found = report.SceneResult(name, loaded.size, [], [], reference.facts(), notes)
+        found = report.SceneResult(name, loaded.size, [], [], reference.to_json(), notes)
         self.results.append(found)
 
         def group() -> None:
@@ -209,13 +209,13 @@ class Suite:
         if guides:
             seconds = f"{guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp)"
             found.notes.append(f"The guides took {seconds}, counted for nobody.")
-        given = reference, guides
+        shared = reference, guides
         bench = benchmark.Bench(loaded, reference, guides, environment.describe(), keep, self.bars, done)
         for case in cases:
             if self.workers is not None:
                 if not bench.recall(case, plan):
                     setup = jobs.Setup.of(loaded, case, loaded.size if settings.sizes else None)
-                    self._later.append(_Later(jobs.Measurement(setup, plan), given, found.name, keep))
+                    self._later.append(_Later(jobs.Measurement(setup, plan), shared, found.name, keep))
                 continue
             try:
                 bench.run([case], plan)

@@ -25,7 +25,7 @@ MIDDLE_GREY = 0.18
 
 @dataclass
 class Image:
-    """A picture with what is known about it.
+    """A picture, its further channels and its metadata.
 
     rgb       float32, shape (height, width, 3), linear; a file with one grey channel `Y` is repeated to three
     channels  every other channel by its name in the file, float32, shape (height, width)
@@ -76,7 +76,7 @@ def write(
     pixels = {"R": image[..., 0], "G": image[..., 1], "B": image[..., 2]}
     for name, values in (channels or {}).items():
         if name in pixels:
-            raise ValueError(f"channel {name!r} is given twice")
+            raise ValueError(f"channel {name!r} appears twice")
         if np.shape(values) != image.shape[:2]:
             raise ValueError(f"channel {name!r} has shape {np.shape(values)}, the image {image.shape[:2]}")
         pixels[name] = values

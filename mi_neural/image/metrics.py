@@ -3,7 +3,7 @@
 Every function takes linear RGB arrays of shape (height, width, 3), computes in float64 and returns plain floats.
 
 Non-finite values never turn an error into NaN. In the *image* a pixel that holds one is treated as black, so it costs
-what a missing pixel costs; :func:`count_nonfinite` says how many there are, and :class:`Errors` carries that count
+what a missing pixel costs; :func:`count_nonfinite` counts them, and :class:`Errors` carries that count
 beside the figures. In the *reference* they are an input error and raise ``ValueError``.
 """
 
@@ -142,11 +142,11 @@ def bias_and_variance(
     of different ones: E[(I_j - R)(I_k - R)] = (E I - R)^2 for all pairs, which is the mean over all ways to halve the
     images and multiply; what the noise of the reference adds to it (`variance`, as in :func:`relmse`) is subtracted. It
     may come out negative where it is below what the samples resolve. Values are ranked for trimming by their mean
-    squared error, which says nothing of the products' sign. Raises ``ValueError`` for fewer than two images.
+    squared error, from which the products' sign does not follow. Raises ``ValueError`` for fewer than two images.
     """
     n = len(images)
     if n < 2:
-        raise ValueError(f"bias and variance are told apart by two images or more, got {n}")
+        raise ValueError(f"bias and variance need two images or more, got {n}")
     total = np.mean([relative_squared_errors(image, reference)[0] for image in images], axis=0)
     mean = np.mean([_black_where_nonfinite(_as_image(image, "image")) for image in images], axis=0)
     of_mean, noise = relative_squared_errors(mean, reference, variance)
@@ -258,12 +258,12 @@ def _flip_evaluator():
     By default they spin: with Dr.Jit's own threads on the same cores FLIP then took 0.7 s instead of 1 ms, and what is
     timed right after it would share the cores with them. OpenMP reads the variable once, when its library is loaded.
     """
-    given = os.environ.get("OMP_WAIT_POLICY")
+    chosen = os.environ.get("OMP_WAIT_POLICY")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         import flip_evaluator
     finally:
-        if given is None:
+        if chosen is None:
             del os.environ["OMP_WAIT_POLICY"]
     return flip_evaluator
 

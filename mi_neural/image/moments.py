@@ -67,7 +67,7 @@ class Moments(Accumulator):
         self.merge(one)
 
     def replace(self, image: np.ndarray, spp: int) -> None:
-        raise TypeError("an image that stands for all passes so far says nothing about their spread")
+        raise TypeError("the spread of passes cannot be taken from an image that stands for all of them")
 
     def merge(self, other: Moments) -> None:
         """Add the passes of `other`, which were rendered with other random numbers."""
