@@ -382,6 +382,33 @@ def test_no_worker_for_a_while():
             wait()
 
 
+@pytest.mark.parametrize("alive", [True, False])
+def test_answer_of_a_worker_that_died_is_not_waited_for(alive):
+    """One that lives may take long to send it."""
+
+    class Slow:
+        calls = 0
+
+        def done(self):
+            return True
+
+        def result(self, timeout):
+            self.calls += 1
+            if self.calls == 3:
+                return "answer"
+            raise distributed.TimeoutError
+
+    class OneWorker:
+        status, scheduler = "running", type("", (), {"address": "tcp://HOST:8786"})
+
+        def nthreads(self):
+            return {"tcp://HOST:1": 1} if alive else {"tcp://HOST:2": 1}
+
+    future = Slow()
+    found = cluster.Workers(OneWorker())._fetch(future, "tcp://HOST:1")
+    assert (found, future.calls) == (("answer", 3) if alive else (None, 1))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", ["worker", "scheduler"])
 def test_lost_cluster_leaves_the_image_of_the_parts_that_are_done(tmp_path, lost):

@@ -230,7 +230,7 @@ class Workers:
                 if future in running:  # else it was given to another worker
                     index, name = running.pop(future)
                     hand_out(names)  # the worker goes on while its answer is fetched
-                    if (answer := self._fetch(future)) is None:
+                    if (answer := self._fetch(future, name)) is None:
                         lost(index, name)
                     else:
                         yield index, answer
@@ -252,16 +252,28 @@ class Workers:
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
             return self.client.submit(bytes, pickle.dumps(data), pure=False)
 
-    def _fetch(self, future) -> Answer | JobError | None:
-        """The answer of a job that is done; None where its worker has died since."""
+    def _fetch(self, future, name: str) -> Answer | JobError | None:
+        """The answer of a job that is done, from the worker `name`; None where that has died since.
+
+        Dask waits for the answer of a dead worker as for one that takes long to be sent. So the worker is looked for
+        after one look's time, and after twice as long each time, as an interrupted answer is sent anew.
+        """
         distributed = _distributed()
         if not future.done():
             return None
+        seconds = LOOK_SECONDS
         try:
-            return future.result(timeout=FETCH_SECONDS)
+            while seconds <= FETCH_SECONDS:
+                try:
+                    return future.result(timeout=seconds)
+                except distributed.TimeoutError:
+                    if name not in self.names():
+                        return None
+                    seconds *= 2
+            return None
         except JobError as error:
             return error
-        except (distributed.TimeoutError, distributed.KilledWorker):
+        except distributed.KilledWorker:
             return None
         except ModuleNotFoundError as error:
             raise ClusterError(
