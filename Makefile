@@ -34,7 +34,7 @@ demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EX
 	@echo "Open out/demo/report.html"
 
 picture: demo  ## the README's picture, of the demo's frames
-	$(BIN)/python -m mi_neural.measure.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
+	$(BIN)/python -m mi_neural.bench.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
 	    out/demo/path_$(k) out/demo/nirc_$(k))
 
 BENCH := -i path -i nirc -i nrc -i nirc:termination=auto -i nirc_two_level --seconds 1 --steady 64 --frame-seconds 0.25 \
@@ -58,10 +58,10 @@ gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light
 	$(GALLERY) lamp_bays $(DIRECT) --size 256x144 -o out/gallery/5_direct_light
 	$(BIN)/mi-neural sequence cornell_box -i path -i nirc:blend=reliability --change "$(LAMP)" --frames 36 --pretrain 128 \
 	    --spp 4 --size 128x128 --no-reference -o out/gallery/6_moving_light
-	$(BIN)/python -m mi_neural.measure.gallery out/gallery
+	$(BIN)/python -m mi_neural.bench.gallery out/gallery
 
 gallery-pictures: gallery  ## the README's pictures, of the gallery
-	$(BIN)/python -m mi_neural.measure.gallery out/gallery --compact scenes/gallery.webp --animation scenes/moving_light.webp
+	$(BIN)/python -m mi_neural.bench.gallery out/gallery --compact scenes/gallery.webp --animation scenes/moving_light.webp
 
 docs: pyproject.toml | $(STAMP)  ## the manual as HTML: out/docs/index.html
 	$(BIN)/python -m pip install --quiet -e '.[docs]'

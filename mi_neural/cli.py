@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import typer
 
+from mi_neural.bench import terminal
 from mi_neural.commands.compare import compare
 from mi_neural.commands.doc import doc
 from mi_neural.commands.info import info
 from mi_neural.commands.plan import plan
 from mi_neural.commands.render import render
 from mi_neural.commands.sequence import sequence
-from mi_neural.measure import terminal
 
 app = typer.Typer(
     add_completion=False,

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from fake_cache import register
 
-from mi_neural.measure import benchmark, budget, denoise, exr, load, metrics, page, reference, repeats, report, suite
+from mi_neural.bench import benchmark, budget, denoise, load, page, reference, repeats, report, suite
+from mi_neural.image import denoise as oidn
+from mi_neural.image import exr, metrics, moments
 
 SIZE = (16, 12)
 #: Keys that results must hold, by the contract of the command line.
@@ -70,7 +72,7 @@ def clock(monkeypatch):
 
 
 def test_accumulator_weighs_by_samples_and_leaves_out_nonfinite_pixels():
-    film = budget.Accumulator()
+    film = moments.Accumulator()
     first, second = np.full((2, 2, 3), 1.0), np.full((2, 2, 3), 4.0)
     second[0, 0, 1], first[1, 1], second[1, 1] = np.nan, np.inf, np.inf
     film.add(first, 1)
@@ -405,9 +407,9 @@ def test_rows_hold_what_the_contract_names(measured):
     pictures, _ = measured
     rows = [p.row for p in pictures]
     for row in rows:
-        facts = json.loads(json.dumps(row.to_json(), allow_nan=False))
-        assert set(KEYS) <= facts.keys()
-        assert facts["parameters"]["max_depth"] == 4
+        entry = json.loads(json.dumps(row.to_json(), allow_nan=False))
+        assert set(KEYS) <= entry.keys()
+        assert entry["parameters"]["max_depth"] == 4
         assert row.mode in benchmark.WITHOUT_PICTURE or (row.relmse > 0.0 and row.flip > 0.0)
         assert row.environment == {"cores": 1}
         assert row.seconds_total == row.seconds_train + row.seconds_render + row.seconds_denoise
@@ -452,7 +454,7 @@ def test_report_is_one_file_that_loads_nothing(measured, tmp_path):
     pictures, ref = measured
     rows = [p.row for p in pictures]
     entries = [page.reference_entry(ref, 0.0), *(page.entry(p, 0.0) for p in pictures if p.rgb is not None)]
-    scene = report.SceneResult("a<b", SIZE, rows, repeats.group(rows), ref.facts(), ["a & b"], entries)
+    scene = report.SceneResult("a<b", SIZE, rows, repeats.group(rows), ref.to_json(), ["a & b"], entries)
     suite.write(report.Report("mi-neural compare", {"cores": 1}, [scene], ["c & d"]), tmp_path)
     text = (tmp_path / "report.html").read_text()
     assert text.count("data:image/png;base64,") == 2 * len(entries) - 1
@@ -484,8 +486,6 @@ def test_a_key_that_no_integrator_knows_is_refused(loaded):
 def test_denoiser_lowers_the_error(path, tmp_path):
     if not has_denoiser():
         pytest.skip("mitsuba-oidn is not installed")
-    from mi_neural.measure import metrics
-
     loaded = load.load_scene("cornell_box", (64, 64), integrator_keys={"max_depth": 4})
     ref = reference.render_reference(loaded, 64, tmp_path)
     noisy = budget.render_samples(loaded.scene, path, 2).rgb
@@ -498,3 +498,6 @@ def test_missing_denoiser_says_what_to_type(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mitsuba_oidn", None)
     with pytest.raises(load.InputError, match=r"pip install 'mi_neural\[denoise\]'"):
         denoise.require()
+    image = np.ones((2, 2, 3), np.float32)
+    with pytest.raises(ImportError, match=r"pip install 'mi_neural\[denoise\]'"):
+        oidn.denoise(image, image, image)

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from mi_neural import scenes
 from mi_neural.cli import app
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 SMALL = ("--size", "16x12")
 

@@ -18,10 +18,11 @@ import pytest
 from scipy import stats
 from typer.testing import CliRunner
 
+from mi_neural.bench import benchmark, budget, changes, cluster, jobs, load, sequence
+from mi_neural.bench.load import InputError
 from mi_neural.cli import app
-from mi_neural.measure import benchmark, budget, changes, cluster, exr, jobs, load, sequence
-from mi_neural.measure.load import InputError
-from mi_neural.measure.moments import Moments
+from mi_neural.image import exr
+from mi_neural.image.moments import Moments
 
 distributed = pytest.importorskip("distributed", reason="no Dask: pip install 'mi_neural[cluster]'")
 
@@ -327,7 +328,7 @@ def test_error_of_a_worker_comes_back_as_one_line_that_names_it(address):
 
 
 WRONG = {
-    "versions": ({"versions": jobs.versions() | {"mitsuba": "1.0"}}, "it has mitsuba 3.* asks has 1.0: install"),
+    "versions": ({"versions": jobs.versions() | {"mitsuba": "1.0"}}, "it has mitsuba 3.* sent the job has 1.0: "),
     "scene": ({"scene": "/nowhere/a.xml"}, "it sees no file /nowhere/a.xml: put scene, meshes and textures where all"),
     "digest": ({"digest": "0"}, r"its .*cornell_box.xml, or a file that it names, is not the one here"),
 }
@@ -379,6 +380,33 @@ def test_no_worker_for_a_while():
     for wait in (workers.count, lambda: next(workers.map([(None, None)]))):
         with pytest.raises(cluster.ClusterError, match=r"no worker at tcp://HOST:8786 for 0.1 s: start one with"):
             wait()
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_answer_of_a_worker_that_died_is_not_waited_for(alive):
+    """One that lives may take long to send it."""
+
+    class Slow:
+        calls = 0
+
+        def done(self):
+            return True
+
+        def result(self, timeout):
+            self.calls += 1
+            if self.calls == 3:
+                return "answer"
+            raise distributed.TimeoutError
+
+    class OneWorker:
+        status, scheduler = "running", type("", (), {"address": "tcp://HOST:8786"})
+
+        def nthreads(self):
+            return {"tcp://HOST:1": 1} if alive else {"tcp://HOST:2": 1}
+
+    future = Slow()
+    found = cluster.Workers(OneWorker())._fetch(future, "tcp://HOST:1")
+    assert (found, future.calls) == (("answer", 3) if alive else (None, 1))
 
 
 @pytest.mark.slow

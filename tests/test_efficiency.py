@@ -5,8 +5,9 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from load_study import load_study
 
-from mi_neural.measure import efficiency
+efficiency = load_study("efficiency")
 
 
 def test_relative_variance_is_that_of_one_sample():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_bad_input_is_refused(tmp_path, rgb):
         exr.write(path, rgb[..., 0])
     with pytest.raises(ValueError, match="'w' has shape"):
         exr.write(path, rgb, {"w": np.ones((2, 2))})
-    with pytest.raises(ValueError, match="given twice"):
+    with pytest.raises(ValueError, match="appears twice"):
         exr.write(path, rgb, {"R": rgb[..., 0]})
     with pytest.raises(ValueError, match="name of the EXR format"):
         exr.write(path, rgb, metadata={"compression": "x"})

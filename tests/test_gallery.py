@@ -9,8 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from mi_neural import cli
-from mi_neural.measure import exr, gallery
-from mi_neural.measure.load import InputError
+from mi_neural.bench import gallery
+from mi_neural.bench.load import InputError
+from mi_neural.image import exr
 
 
 @pytest.fixture

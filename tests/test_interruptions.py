@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 SMALL = ("cornell_box", "--size", "16x16")
 COMPARE = ("compare", *SMALL, "-i", "path", "-i", "plain_path", "--seconds", "0.1,0.2", "--reference-spp", "32",
@@ -87,7 +87,7 @@ def test_killed_rendering_leaves_the_image_that_was_kept_last():
     """As it is kept every minute; here five times a second."""
     arguments = ["mi-neural", "render", *SMALL, "-i", "path", "--seconds", "60", "-o", "a.exr"]
     code = (
-        f"import sys; sys.argv = {arguments}\nfrom mi_neural.measure import budget; budget.KEEP_SECONDS = 0.2\n"
+        f"import sys; sys.argv = {arguments}\nfrom mi_neural.bench import budget; budget.KEEP_SECONDS = 0.2\n"
         "from mi_neural.cli import main; main()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
@@ -165,9 +165,9 @@ def limited() -> None:
 
 
 WRITERS = {
-    "exr": "from mi_neural.measure import exr; exr.write('old', rng.random((64, 64, 3)))",
-    "png": "from mi_neural.measure import exr; exr.write_png('old', rng.random((64, 64, 3)))",
-    "text": "from mi_neural.measure import exr; exr.write_text('old', 'x' * 10000)",
+    "exr": "from mi_neural.image import exr; exr.write('old', rng.random((64, 64, 3)))",
+    "png": "from mi_neural.image import exr; exr.write_png('old', rng.random((64, 64, 3)))",
+    "text": "from mi_neural.image import exr; exr.write_text('old', 'x' * 10000)",
     "cache": "from mi_neural.caches import files; files.write('old', 'incident', {}, {'a': rng.random(10000)})",
 }
 

@@ -4,8 +4,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from load_study import load_study
 
-from mi_neural.lights import fit_ltc, ltc
+from mi_neural.lights import ltc
+
+fit_ltc = load_study("fit_ltc")
 
 GRID = 160  # points of a brute-force sum along each axis of a light
 
@@ -242,7 +245,7 @@ def test_lobe_at_a_node_is_the_cell():
     cells = np.load(ltc.FILE)["table"].astype(float)
     for i, j in ((0, 5), (10, 30), (63, 63), (40, 0)):
         alpha, cos_theta = fit_ltc.roughness()[i], fit_ltc.cosines()[j]
-        m11, m22, m13 = fit_ltc.entries(cells[i, j, :3], alpha, cos_theta)
+        m11, m22, m13 = ltc.entries(cells[i, j, :3], alpha, cos_theta)
         lobe = ltc.lobe(mi.Float(alpha), mi.Vector3f(*fit_ltc.view(cos_theta).tolist()))
         np.testing.assert_allclose(np.array(lobe.x).ravel() * m11, [1, 0, -m13], rtol=2e-3, atol=1e-6)
         np.testing.assert_allclose(np.array(lobe.y).ravel() * m22, [0, 1], rtol=2e-3, atol=1e-6)

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_neural.measure import metrics
+from mi_neural.image import metrics
 
 
 def grey(value: float, height: int = 8, width: int = 10) -> np.ndarray:

@@ -148,7 +148,7 @@ def known(name: str) -> None:
 
 
 def test_unknown_names_are_noticed():
-    known("mi_neural.measure.metrics.relmse")
+    known("mi_neural.image.metrics.relmse")
     with pytest.raises(AttributeError):
-        known("mi_neural.measure.metrics.nonsense")
+        known("mi_neural.image.metrics.nonsense")
     assert "ipykernel" not in sys.modules  # kernels are processes of their own

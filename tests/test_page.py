@@ -9,7 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from mi_neural.measure import page, report
+from mi_neural.bench import page, report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 BROWSER = next((found for name in BROWSERS if (found := shutil.which(name))), "")

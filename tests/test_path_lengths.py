@@ -1,12 +1,15 @@
-"""`mi_neural.measure.path_lengths`: rays at equal bias, the command."""
+"""`studies/path_lengths.py`: rays at equal bias, the command."""
 
 import json
 
 import numpy as np
 import pytest
+from load_study import load_study
 
-from mi_neural.measure import exr, path_lengths
-from mi_neural.measure.path_lengths import Point, factors
+from mi_neural.image import exr
+
+path_lengths = load_study("path_lengths")
+Point, factors = path_lengths.Point, path_lengths.factors
 
 
 def test_factor_is_the_rays_of_nrc_at_the_bias_of_nirc():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from expectation import assert_same_mean, renders
 from light_scenes import MIXED, scene_of
+from load_study import load_study
 from test_cli import run
 from test_incident import load
 
@@ -310,7 +311,9 @@ def test_inputs_that_are_left_out_do_not_raise_the_error():
 @pytest.mark.parametrize("name, type_", [("cornell_box", "nirc"), ("cornell_box", "nrc"), ("ajar_door", "nirc")])
 def test_planned_is_faster_than_everything_and_no_worse(name, type_, tmp_path):
     """In a scene of one light: by the ablation's own measure, at half of what it finds there."""
-    from mi_neural.measure import ablation, load
+    from mi_neural.bench import load
+
+    ablation = load_study("ablation")
 
     loaded = load.load_scene(name, (64, 64))
     reference = ablation.reference_of(loaded, tmp_path, 512, None)

@@ -1,11 +1,14 @@
-"""`measure.profile`: parts add up, rates are those of what was computed, the first image is there before the last; and
-previews while a cache trains."""
+"""`studies/frame_profile.py`: parts add up, rates are those of what was computed, the first image is there before the
+last; and previews while a cache trains."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from load_study import load_study
 
-from mi_neural.measure import budget, load, profile
+from mi_neural.bench import budget, load
+
+profile = load_study("frame_profile")
 
 SMALL = {"type": "nirc", "levels": 2, "hashmap_size": 256, "width": 8, "train_samples": 128, "train_vertices": 4}
 

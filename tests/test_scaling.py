@@ -8,8 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fake_cache import register
+from load_study import load_study
 
-from mi_neural.measure import budget, load, memory, scaling, split
+from mi_neural.bench import budget, load, memory, split
+
+scaling = load_study("scaling")
 
 
 def points(costs: dict[float, float]) -> list[scaling.Point]:
@@ -147,6 +150,6 @@ def test_peak_is_counted_anew():
     assert memory.peak_mib() < before + 64
 
 
-def test_system_that_does_not_tell(monkeypatch, tmp_path):
+def test_system_that_does_not_count_it(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "none")
     assert memory.start() is False and memory.peak_mib() is None

@@ -10,9 +10,10 @@ import pytest
 from fake_cache import register
 from typer.testing import CliRunner
 
+from mi_neural.bench import benchmark, changes, load, plots, sequence
+from mi_neural.bench.load import InputError
 from mi_neural.cli import app
-from mi_neural.measure import benchmark, changes, exr, load, plots, sequence
-from mi_neural.measure.load import InputError
+from mi_neural.image import exr
 
 T = mi.ScalarTransform4f
 N = 24  # pixels of a side

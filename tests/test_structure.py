@@ -21,13 +21,13 @@ FOLDERS = {"mi_neural.integrators": "integrators", "mi_neural.emitters": "emitte
 
 # Imports go from higher to lower layers; rooms on one layer do not know one another.
 LAYERS = [
-    {"llvm", "scenes", "estimators"},
+    {"llvm", "scenes", "estimators", "image"},
     {"render"},
     {"caches", "lights"},
     {"plan"},
     {"emitters"},  # light samplers do not know integrators
     {"integrators"},
-    {"measure"},
+    {"bench"},
     {"explore"},
     {"manual"},
     {"commands"},
@@ -38,7 +38,8 @@ STARTUP = {"", "registration"}
 
 # What must stay a function of samples or of features, whatever the scene
 BLIND = ["caches/field.py", "caches/encoding.py", "caches/loss.py", "estimators/two_level.py",
-         "estimators/reservoir.py"]  # fmt: skip
+         "estimators/reservoir.py", "image/exr.py", "image/metrics.py", "image/moments.py",
+         "image/denoise.py"]  # fmt: skip
 
 
 def sources() -> dict[str, Path]:
@@ -96,6 +97,15 @@ def test_package_list_matches_the_folders():
 
 def test_package_map_matches_the_folders():
     assert project()["tool"]["setuptools"]["package-dir"] == FOLDERS
+
+
+def test_studies_and_tests_are_in_no_package():
+    """What is installed are the listed packages alone, and neither folder lies in one of them."""
+    settings = project()["tool"]["setuptools"]
+    folders = {ROOT / settings["package-dir"].get(name, name.replace(".", "/")) for name in settings["packages"]}
+    assert all(folder.is_dir() for folder in folders)
+    for left_out in (ROOT / "studies", ROOT / "tests"):
+        assert not folders & {left_out, *left_out.parents} and not (left_out / "__init__.py").exists()
 
 
 def test_versions_agree():

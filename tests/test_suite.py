@@ -12,8 +12,9 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from mi_neural import scenes
+from mi_neural.bench import benchmark, collection, curves, load, reference, repeats, report, suite
 from mi_neural.cli import app
-from mi_neural.measure import benchmark, collection, curves, exr, load, metrics, reference, repeats, report, suite
+from mi_neural.image import exr, metrics
 
 SCENE = """<scene version="3.0.0">
     <default name="level" value="1"/>

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
+from mi_neural.bench import benchmark, cluster, collection, denoise, load, report, suite, terminal
+from mi_neural.bench.load import InputError
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, cluster, collection, denoise, load, report, suite, terminal
-from mi_neural.measure.load import InputError
 
 DEFAULT_SECONDS = "1,2,4,8"
 DEFAULT_FRAME_SECONDS = "0.25,1"

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from mi_neural.bench import terminal
+from mi_neural.bench.load import InputError
 from mi_neural.commands.options import readable
-from mi_neural.measure import terminal
-from mi_neural.measure.load import InputError
 
 
 @readable

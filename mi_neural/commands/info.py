@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rich.table import Table
 
+from mi_neural.bench import environment, terminal
 from mi_neural.commands import options
-from mi_neural.measure import environment, terminal
 
 
 @options.readable

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from mi_neural.measure import load, terminal
-from mi_neural.measure.load import InputError
+from mi_neural.bench import load, terminal
+from mi_neural.bench.load import InputError
 
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="a Mitsuba XML file, or the name of a shipped scene")]
 Set = Annotated[

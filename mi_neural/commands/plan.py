@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from mi_neural.bench import benchmark, load, terminal
+from mi_neural.bench.load import InputError
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, load, terminal
-from mi_neural.measure.load import InputError
 
 
 @options.readable

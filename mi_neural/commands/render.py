@@ -8,10 +8,11 @@ from typing import Annotated
 
 import typer
 
+from mi_neural.bench import benchmark, budget, cluster, denoise, environment, jobs, load, repeats, terminal
+from mi_neural.bench import reference as references
+from mi_neural.bench.load import InputError
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, budget, cluster, denoise, environment, exr, jobs, load, repeats, terminal
-from mi_neural.measure import reference as references
-from mi_neural.measure.load import InputError
+from mi_neural.image import exr
 
 #: Seconds of training after which `render` writes a first image of one sample a pixel, to be replaced by the final one.
 PREVIEW_SECONDS = 1.0

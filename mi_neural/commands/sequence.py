@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
+from mi_neural.bench import benchmark, changes, cluster, denoise, environment, load, plots, terminal
+from mi_neural.bench import sequence as sequences
+from mi_neural.bench.load import InputError
 from mi_neural.commands import options
-from mi_neural.measure import benchmark, changes, cluster, denoise, environment, load, plots, terminal
-from mi_neural.measure import sequence as sequences
-from mi_neural.measure.load import InputError
 
 DEFAULT_FRAMES = 60
 DEFAULT_REFERENCE_SPP = 256

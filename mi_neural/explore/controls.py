@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.measure import changes
+from mi_neural.bench import changes
 
 #: What a light shines with, in Mitsuba's names; textures' values are multiplied.
 BRIGHTNESS = re.compile(r"(radiance|irradiance|intensity)\.(value|data)|scale|sun_scale|sky_scale")

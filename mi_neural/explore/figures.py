@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import NullFormatter
 
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 #: Inches of a figure across, and pixels an inch.
 WIDTH, DPI = 9.0, 100

@@ -6,7 +6,7 @@ import ipywidgets as w
 import numpy as np
 
 from mi_neural.explore.controls import settings
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 _WIDE = w.Layout(width="28em")
 

@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 #: Of a curve; of more, some are left out.
 MOST_POINTS = 1000

@@ -8,11 +8,12 @@ import time
 import mitsuba as mi
 import numpy as np
 
+from mi_neural.bench.budget import STREAM_IMAGE, pass_seed, render_pass, reset, statistics
+from mi_neural.bench.load import split_channels
+from mi_neural.bench.reference import load_reference
 from mi_neural.explore import controls
-from mi_neural.measure import exr, metrics
-from mi_neural.measure.budget import STREAM_IMAGE, Accumulator, pass_seed, render_pass, reset, statistics
-from mi_neural.measure.load import split_channels
-from mi_neural.measure.reference import load_reference
+from mi_neural.image import exr, metrics
+from mi_neural.image.moments import Accumulator
 
 
 class Session:

@@ -18,7 +18,7 @@ import numpy as np
 from jupyter_rfb import RemoteFrameBuffer
 
 from mi_neural.explore import panels, pictures, views
-from mi_neural.measure import exr
+from mi_neural.image import exr
 
 #: What the picture's place can show.
 SHOWN = ("picture", "reliability", "visibility", "visibility, traced")

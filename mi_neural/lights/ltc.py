@@ -2,7 +2,7 @@
 
 Heitz, Dupuy, Hill, Neubelt 2016, "Real-time polygonal-light shading with linearly transformed cosines". A GGX lobe
 times cosine is a matrix M applied to a clamped cosine, so that its integral over a polygon is the clamped cosine's over
-the polygon times M^-1. `fit_ltc` makes the table of M.
+the polygon times M^-1. `studies/fit_ltc.py` makes the table of M.
 
 All coordinates are local to the shading point: the origin is the point, z its normal. Vertices between 1e-15 and 1e15
 units away are handled in single precision.
@@ -19,10 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import fit_ltc
-
 FILE = Path(__file__).with_name("ltc_ggx.npz")
 
+#: Smallest roughness of the table; sharper lobes are taken to be as sharp.
+ALPHA_MIN = 1e-3
+#: Smallest cosine of the view direction.
+COS_MIN = 1e-2
 #: Vertices of the polygon that stands for a disk.
 DISK_VERTICES = 8
 #: Square of the angular size (largest distance of a vertex from the first, over that of the centre from the origin)
@@ -134,8 +136,19 @@ class Lobe:
     b: mi.Float
 
 
+def entries(q, alpha, cos_theta):
+    """(m11, m22, m13) from the stored (q11, q22, q13): the limits of sharp lobes and of grazing views factored out.
+
+    Sharp lobes (α -> 0) have ``2α/cos²θ, 2α, -tan θ``, that is q = (2, 2, 1) at every θ; towards grazing views cos θ
+    ceases to matter where it falls below α.
+    """
+    wide = cos_theta * cos_theta + alpha * alpha
+    tangent = ((1 - cos_theta * cos_theta) / wide) ** 0.5
+    return q[0] * alpha / wide, q[1] * alpha, -q[2] * tangent
+
+
 def table():
-    """The fitted table for the current variant: a flat Float of 8 numbers a cell (`fit_ltc.fit`, then zeros).
+    """The fitted table for the current variant: a flat Float of 8 numbers a cell (q11, q22, q13, a, b, zeros).
 
     Loaded at the first call for a variant. What is frozen (``dr.freeze``) must be given it as an argument.
     """
@@ -157,11 +170,11 @@ def lobe(alpha, wi, cells=None, active=True) -> Lobe:
     """
     cells = table() if cells is None else cells
     size = round((dr.width(cells) // 8) ** 0.5)
-    cos_theta = dr.clip(wi.z, fit_ltc.COS_MIN, 1)
-    alpha = dr.clip(alpha, fit_ltc.ALPHA_MIN, 1)
-    low, high = fit_ltc.ALPHA_MIN**0.5, (1 - fit_ltc.COS_MIN) ** 0.5
+    cos_theta = dr.clip(wi.z, COS_MIN, 1)
+    alpha = dr.clip(alpha, ALPHA_MIN, 1)
+    low, high = ALPHA_MIN**0.5, (1 - COS_MIN) ** 0.5
     q, b = _bilinear(cells, size, (dr.sqrt(alpha) - low) / (1 - low), dr.sqrt(1 - cos_theta) / high, active)
-    m11, m22, m13 = fit_ltc.entries(q, alpha, cos_theta)
+    m11, m22, m13 = entries(q, alpha, cos_theta)
 
     across = dr.squared_norm(wi.xy)
     is_round = across < 1e-12

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from mi_neural.measure import exr
-from mi_neural.measure.terminal import DEFAULT_VARIANT, set_variant
+from mi_neural.bench.terminal import DEFAULT_VARIANT, set_variant
+from mi_neural.image import exr
 
 #: Pixel of the Cornell box (256x256) whose hemisphere is shown, training frames, paths a direction.
 PIXEL, FRAMES, PATHS = (60, 120), 300, 256
@@ -14,8 +14,8 @@ PIXEL, FRAMES, PATHS = (60, 120), 300, 256
 
 def hemisphere(path: Path) -> None:
     """Incident light at a point: by the incident cache, by the outgoing cache, path-traced."""
+    from mi_neural.bench.load import IntegratorSpec, build_integrator, load_scene
     from mi_neural.explore import pictures, views
-    from mi_neural.measure.load import IntegratorSpec, build_integrator, load_scene
 
     scene = load_scene("cornell_box").scene
     shown = []

@@ -11,15 +11,15 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from mi_neural.image import exr
 from mi_neural.manual import pages
-from mi_neural.measure import exr
 
 #: What the Python pages are of: the interface that the guides speak of.
 MODULES = ("mi_neural", "mi_neural.explore.live", "mi_neural.explore.session", "mi_neural.explore.views",
            "mi_neural.caches.field", "mi_neural.caches.incident", "mi_neural.caches.outgoing",
            "mi_neural.caches.visibility", "mi_neural.caches.radiance_cache", "mi_neural.lights.sampling",
            "mi_neural.lights.table", "mi_neural.estimators.two_level", "mi_neural.estimators.reservoir",
-           "mi_neural.measure.metrics", "mi_neural.measure.exr", "mi_neural.measure.changes",
+           "mi_neural.image.metrics", "mi_neural.image.exr", "mi_neural.bench.changes",
            "mi_neural.scenes")  # fmt: skip
 
 STYLE = """

@@ -1,0 +1,174 @@
+"""One self-contained HTML page of a comparison: contents, tables, curves, pictures that are zoomed together.
+
+The page holds everything: pictures as data URLs, curves as inline SVG, style and script inline. It loads nothing.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from mi_neural.image import exr
+
+from . import curves
+from .benchmark import Picture
+from .reference import Reference
+from .report import Report, SceneResult, html_table, name_of, number, split_table, summary, table
+
+#: What the modes of rows mean, in the order in which a page shows them.
+MODE_TEXT = {
+    "one-shot": "One image from nothing: wall time from compiled kernels, training included",
+    "sample": "One-sample frames of a running sequence, trained before",
+    "steady": "Frames of a running sequence at equal time, trained before; the denoiser's time is part of the frame",
+}
+#: Modes whose errors are drawn together, by the name of the drawing.
+CURVES = {"one-shot": ("one-shot",), "unfinished": ("curve",), "steady": ("sample", "steady")}
+CURVE_TEXT = {
+    "one-shot": "Error of finished images over their budget",
+    "unfinished": "Error of the longest image while it was rendered, after 1, 2, 4, ... samples",
+    "steady": "Error of frames over their time",
+}
+#: Bytes of pixels up to which a page's pictures are kept exactly; beyond, they are JPEG.
+EXACT_BYTES = 30e6
+JPEG_QUALITY = 88
+
+
+def style() -> str:
+    """The page's style sheet."""
+    return Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+
+
+def curves_of(scene: SceneResult) -> dict[str, str]:
+    """Drawings of a scene as SVG, by their name; those with nothing to draw are left out."""
+    drawn = {kind: curves.svg(scene.rows, modes) for kind, modes in CURVES.items()}
+    return {kind: svg for kind, svg in drawn.items() if svg}
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Pictures
+
+
+def entry(picture: Picture, exposure: float, exact: bool = True) -> dict[str, object]:
+    """What the viewer shows of a picture: name, caption, by what it can be chosen, image and FLIP map."""
+    row = picture.row
+    kind = row.mode + (f" {row.budget_seconds:g} s" if row.budget_seconds else "")
+    errors = [
+        f"{title} {number(value)}"
+        for title, value in (("trimmed relMSE", row.relmse_trimmed), ("FLIP", row.flip), ("flicker", row.flicker))
+        if value is not None
+    ]
+    return {
+        "name": f"{name_of(row)}, {kind}",
+        "caption": ", ".join([f"{number(row.spp)} spp", *errors]),
+        "integrator": row.label,
+        "kind": kind,
+        "denoiser": "denoised" if row.denoised else "raw",
+        "image": data_url(exr.to_srgb8(picture.rgb, exposure), exact),
+        "error": None if picture.flip_map is None else data_url(flip_colours(picture.flip_map), exact),
+    }
+
+
+def reference_entry(reference: Reference, exposure: float, exact: bool = True) -> dict[str, object]:
+    """The reference as the viewer's first picture."""
+    spp, error = reference.metadata.get("spp"), reference.standard_error()
+    caption = [f"{spp} spp"] if spp else []
+    caption += [f"standard error of a pixel {100 * error:.2g} %"] if error is not None else []
+    image = data_url(exr.to_srgb8(reference.rgb, exposure), exact)
+    return {"name": "reference", "caption": ", ".join(caption), "image": image, "error": None}
+
+
+def flip_colours(flip_map: np.ndarray) -> np.ndarray:
+    """A FLIP map in [0, 1] in the magma colours its authors use, uint8 of shape (height, width, 3)."""
+    from matplotlib import colormaps
+
+    return colormaps["magma"](np.clip(flip_map, 0.0, 1.0), bytes=True)[..., :3].copy()
+
+
+def data_url(rgb8: np.ndarray, exact: bool = True) -> str:
+    """Pixels as a data URL: PNG, or JPEG where they need not be `exact`."""
+    if exact:
+        return "data:image/png;base64," + base64.b64encode(exr.png_bytes(rgb8)).decode()
+    from PIL import Image  # comes with matplotlib
+
+    buffer = io.BytesIO()
+    Image.fromarray(rgb8).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# The page
+
+
+def page(report: Report, drawn: dict[tuple[str, str], str]) -> str:
+    """The report as one HTML document; `drawn` holds the curves by scene and kind."""
+    several = len(report.scenes) > 1
+    title = "Speed against error" if several else f"{report.scenes[0].name}: speed against error"
+    contents = [("summary", "Summary")] if several else []
+    contents += [(f"scene-{k}", scene.name) for k, scene in enumerate(report.scenes)]
+    sections = [_summary(report)] if several else []
+    for k, scene in enumerate(report.scenes):
+        sections.append(_scene(scene, k, {kind: svg for (name, kind), svg in drawn.items() if name == scene.name}))
+    environment = "\n".join(f"{k:16} {v}" for k, v in report.environment.items())
+    pictures = json.dumps([{"size": s.size, "pictures": s.entries} for s in report.scenes]).replace("</", "<\\/")
+    links = "".join(f'<a href="#{at}">{html.escape(text)}</a>' for at, text in [*contents, ("made", "How it was made")])
+    return "\n".join(
+        [
+            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width">',
+            f"<title>{html.escape(title)}</title>\n<style>\n{style()}</style></head><body>",
+            f"<h1>{html.escape(title)}</h1>",
+            _notes(report.notes),
+            f"<nav>{links}</nav>",
+            *sections,
+            '<section id="made"><h2>How it was made</h2>',
+            f"<pre>{html.escape(report.command)}</pre>\n<pre>{html.escape(environment)}</pre></section>",
+            f'<script type="application/json" id="pictures">{pictures}</script>',
+            f"<script>\n{Path(__file__).with_name('page.js').read_text(encoding='utf-8')}</script>\n</body></html>\n",
+        ]
+    )
+
+
+def _notes(notes: list[str]) -> str:
+    return f'<ul class="notes">{"".join(f"<li>{html.escape(n)}</li>" for n in notes)}</ul>' if notes else ""
+
+
+def _wide(cells: list[list[str]]) -> str:
+    return f'<div class="wide">{html_table(cells)}</div>'
+
+
+def _summary(report: Report) -> str:
+    parts = [
+        '<section id="summary"><h2>Summary</h2>',
+        "<p>Trimmed relMSE / FLIP. Factor: by how much trimmed relMSE is below that of the first integrator, denoised "
+        "or not as in this line; geometric mean over the scenes.</p>",
+    ]
+    for title, cells in summary(report):
+        parts.append(f"<h3>{html.escape(title)}</h3>{_wide(cells)}")
+    return "\n".join(parts) + "</section>"
+
+
+def _scene(scene: SceneResult, k: int, drawn: dict[str, str]) -> str:
+    parts = [f'<section id="scene-{k}"><h2>{html.escape(scene.name)}, {scene.size[0]}x{scene.size[1]}</h2>']
+    parts.append(_notes(scene.notes))
+    for mode, text in MODE_TEXT.items():
+        if of_mode := [g for g in scene.groups if g.first.mode == mode]:
+            parts.append(f"<h3>{html.escape(text)}</h3>{_wide(table(of_mode))}")
+    if frames := split_table(scene.groups):
+        parts.append(
+            "<h3>Where the time of a one-sample frame goes, in ms</h3>" + _wide(frames) + '<p class="about">'
+            "Kernels by Dr.Jit's own clocks; one fused kernel holds queries and tracing, so queries are their number "
+            "times what one costs in a kernel of its own. Python: wall time in which no kernel runs.</p>"
+        )
+    if scene.entries:
+        parts.append(
+            f'<h3>Pictures</h3><div class="viewer" id="viewer-{k}"></div><p class="about">Click a picture, then: wheel '
+            "or double-click zooms, dragging moves, all pictures follow.</p>"
+        )
+    for kind, svg in drawn.items():
+        parts.append(f'<h3>{html.escape(CURVE_TEXT[kind])}</h3><div class="curves">{svg}</div>')
+    return "\n".join(part for part in parts if part) + "</section>"

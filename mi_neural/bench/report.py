@@ -1,0 +1,221 @@
+"""Tables out of benchmark rows: as text, Markdown, HTML, JSON, CSV.
+
+Rows that differ by their repeat alone are one line of a table, with a confidence interval (:mod:`.repeats`).
+"""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, fields
+
+import numpy as np
+
+from .benchmark import Row, plain
+from .repeats import LEVEL, Group
+
+#: Headings and cells of every table, in order.
+COLUMNS = (
+    ("integrator", lambda g: name_of(g.first)),
+    ("mode", lambda g: g.first.mode),
+    ("budget s", lambda g: number(g.first.budget_seconds)),
+    ("spp", lambda g: number(g.mean("spp"))),
+    ("train s", lambda g: number(g.mean("seconds_train"))),
+    ("render s", lambda g: number(g.mean("seconds_render"))),
+    ("denoise s", lambda g: number(g.mean("seconds_denoise")) if g.first.denoised else ""),
+    ("ns/sample", lambda g: number(g.mean("ns_per_sample"))),
+    ("relMSE trimmed", lambda g: interval(g, "relmse_trimmed")),
+    ("bias²", lambda g: number(g.squared_bias) + _error(g.squared_bias_error)),
+    ("variance", lambda g: number(g.variance)),
+    ("relMSE", lambda g: interval(g, "relmse")),
+    ("FLIP", lambda g: interval(g, "flip")),
+    ("flicker", lambda g: interval(g, "flicker")),
+    ("peak MiB", lambda g: number(_rounded(g.mean("peak_mib")))),
+)
+#: Parts of a frame, as :class:`.split.Split` names them.
+PARTS = ("train", "query", "trace", "film", "python")
+#: Fields of a row that a table of numbers has no room for.
+NESTED = ("parameters", "statistics", "environment", "split", "size")
+
+
+@dataclass
+class SceneResult:
+    """Results of one scene. `reference`: :meth:`.Reference.to_json`; `entries`: the pictures of :mod:`.page`; `notes`:
+    lines that a reader must know."""
+
+    name: str
+    size: tuple[int, int]
+    rows: list[Row]
+    groups: list[Group]
+    reference: dict[str, object] | None
+    notes: list[str] = field(default_factory=list)
+    entries: list[dict[str, object]] = field(default_factory=list)
+
+
+@dataclass
+class Report:
+    """What a comparison found; `command` is what was typed, `notes` concern all scenes."""
+
+    command: str
+    environment: dict[str, object]
+    scenes: list[SceneResult]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def rows(self) -> list[Row]:
+        return [row for scene in self.scenes for row in scene.rows]
+
+
+def table(groups: Iterable[Group]) -> list[list[str]]:
+    """Cells as text, the headings first; columns that are empty in every line, or of one mode, are left out."""
+    groups = list(groups)
+    columns = COLUMNS if len({g.first.mode for g in groups}) > 1 else [c for c in COLUMNS if c[0] != "mode"]
+    cells = [[name for name, _ in columns], *([cell(g) for _, cell in columns] for g in groups)]
+    kept = [k for k in range(len(columns)) if any(line[k] for line in cells[1:])]
+    return [[line[k] for k in kept] for line in cells]
+
+
+def split_table(groups: Iterable[Group]) -> list[list[str]]:
+    """Where the time of a one-sample frame goes, in milliseconds and parts of it; empty without such rows."""
+    lines = []
+    for g in groups:
+        found = [row.split for row in g.rows if row.split]
+        if not found:
+            continue
+        means = {name: np.mean([s[name] or 0.0 for s in found]) for name in ("total", *PARTS)}
+        parts = [f"{1e3 * means[p]:.2f} ({100 * means[p] / means['total']:.0f} %)" if means[p] else "" for p in PARTS]
+        compile_ = number(max(row.seconds_compile for row in g.rows))
+        lines.append([name_of(g.first), compile_, f"{1e3 * means['total']:.1f}", *parts])
+    return [["integrator", "compile s", "frame ms", *PARTS], *lines] if lines else []
+
+
+def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
+    """One table for each mode and budget: integrators over scenes, trimmed relMSE / FLIP, and by which factor trimmed
+    relMSE is below that of the first integrator with as much denoising: a geometric mean over the scenes where
+    neither is below what the reference resolves, left out where a scene is missing."""
+    tables = []
+    groups = [g for scene in report.scenes for g in scene.groups if g.mean("relmse_trimmed") is not None]
+    for mode, budget in dict.fromkeys((g.first.mode, g.first.budget_seconds) for g in groups):
+        if mode == "split":
+            continue
+        of_mode = [g for g in groups if (g.first.mode, g.first.budget_seconds) == (mode, budget)]
+        kinds = list(dict.fromkeys((g.first.label, g.first.denoised) for g in of_mode))
+        cells = [["integrator", *(scene.name for scene in report.scenes), "factor"]]
+        for label, denoised in kinds:
+            errors, texts = {}, []
+            for scene in report.scenes:
+                found = {g.key: g for g in scene.groups}
+                g = found.get((label, mode, budget, denoised))
+                texts.append("" if g is None else f"{number(g.mean('relmse_trimmed'))} / {number(g.mean('flip'))}")
+                first = found.get((kinds[0][0], mode, budget, denoised))
+                if g is not None and first is not None:
+                    errors[scene.name] = first.mean("relmse_trimmed"), g.mean("relmse_trimmed")
+            ratios = [np.log(a / b) for a, b in errors.values() if a and b]
+            complete = ratios and len(errors) == len(report.scenes)
+            cells.append([label + (" + denoiser" if denoised else ""), *texts,
+                          number(float(np.exp(np.mean(ratios)))) if complete else ""])  # fmt: skip
+        tables.append((f"{mode}{f' {budget:g} s' if budget else ''}", cells))
+    return tables
+
+
+def results(report: Report) -> dict[str, object]:
+    """What `results.json` holds."""
+    return plain(
+        {
+            "command": report.command,
+            "environment": report.environment,
+            "notes": report.notes,
+            "scenes": [
+                {"scene": s.name, "size": s.size, "reference": s.reference, "notes": s.notes} for s in report.scenes
+            ],
+            "groups": [g.to_json() for scene in report.scenes for g in scene.groups],
+            "rows": [row.to_json() for row in report.rows],
+        }
+    )
+
+
+def comma_separated(rows: Iterable[Row]) -> str:
+    """The rows as CSV: all that is a number, a text or a truth, keys of integrators and parts of frames beside it."""
+    names = [f.name for f in fields(Row) if f.name not in NESTED]
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([*names, "width", "height", "parameters", *(f"split_{part}" for part in ("total", *PARTS))])
+    for row in rows:
+        values = plain(asdict(row))
+        parameters = " ".join(f"{k}={v}" for k, v in values["parameters"].items())
+        parts = [(values["split"] or {}).get(part) for part in ("total", *PARTS)]
+        writer.writerow([*(values[name] for name in names), *row.size, parameters, *parts])
+    return buffer.getvalue()
+
+
+def tables(report: Report) -> str:
+    """All tables in Markdown."""
+    several = len(report.scenes) > 1
+    parts = [f"## {title}\n\n{markdown(cells)}" for title, cells in summary(report)] if several else []
+    for scene in report.scenes:
+        heading = f"## {scene.name} {scene.size[0]}x{scene.size[1]}\n\n" if several else ""
+        cells = table(g for g in scene.groups if g.first.mode != "split")
+        parts.append(heading + (markdown(cells) if len(cells) > 1 else ""))
+        if frames := split_table(scene.groups):
+            parts.append(markdown(frames))
+    return "\n".join(parts)
+
+
+def markdown(cells: list[list[str]]) -> str:
+    """A table, its headings first, in Markdown."""
+    head, *body = cells
+    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *body]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+def html_table(cells: list[list[str]]) -> str:
+    """A table, its headings first, in HTML."""
+    head, *body = cells
+
+    def line(cells: list[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
+
+    return "<table>" + line(head, "th") + "".join(line(cells, "td") for cells in body) + "</table>"
+
+
+def name_of(row: Row) -> str:
+    """An integrator's label, and whether its image was denoised."""
+    return row.label + (" + denoiser" if row.denoised else "")
+
+
+def repeats_note(groups: list[Group]) -> str | None:
+    """How the intervals in the tables were made; None where nothing was repeated."""
+    n = max((len(g.rows) for g in groups), default=0)
+    if n < 2:
+        return None
+    return (
+        f"{n} repeats with independent seeds, of images and of training: figures are means, ± is half of Student's "
+        f"{100 * LEVEL:.0f} % confidence interval of the mean. Bias² and variance are those of one image, in sum about "
+        "trimmed relMSE. Bias² comes from products of different repeats, so that their noise cancels, less the "
+        "reference's variance; its ± is one standard error, over the repeats (jackknife) and of the reference. It is "
+        "not resolved below the reference's own noise in relMSE, as errors are divided by a noisy reference."
+    )
+
+
+def interval(found: Group, name: str) -> str:
+    """Mean and half-width of a field, `0.0123 ± 0.0004`; the mean alone where there is one row."""
+    return number(found.mean(name)) + _error(found.half_width(name))
+
+
+def _error(value: float | None) -> str:
+    return "" if value is None else f" ± {value:.2g}"
+
+
+def _rounded(value: float | None) -> int | None:
+    return None if value is None else round(value)
+
+
+def number(value: float | int | None) -> str:
+    """Three significant digits, no exponent where it can be helped, empty for None."""
+    if value is None:
+        return ""
+    if value == 0 or isinstance(value, int) or float(value).is_integer():
+        return str(int(value))
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -1,0 +1,93 @@
+"""Mean and variance of an image from its passes, wherever they were rendered."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Accumulator:
+    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted."""
+
+    def __init__(self) -> None:
+        self.total: np.ndarray | None = None
+        self.weight: np.ndarray | None = None
+        self.spp = 0
+        self.nonfinite = 0
+
+    def add(self, image: np.ndarray, spp: int) -> None:
+        """Add a developed film of shape (height, width, channels) that was rendered with `spp` samples a pixel."""
+        image = np.asarray(image, np.float64)
+        if self.total is None:
+            self.total = np.zeros_like(image)
+            self.weight = np.zeros((*image.shape[:2], 1))
+        finite = np.isfinite(image).all(axis=-1, keepdims=True)
+        n_bad = finite.size - np.count_nonzero(finite)
+        self.total += spp * (np.where(finite, image, 0.0) if n_bad else image)
+        self.weight += spp * finite
+        self.nonfinite += n_bad
+        self.spp += spp
+
+    def replace(self, image: np.ndarray, spp: int) -> None:
+        """Add a film that already stands for all passes so far, `spp` more samples a pixel included."""
+        spp, nonfinite = spp + self.spp, self.nonfinite
+        self.__init__()
+        self.add(image, spp)
+        self.nonfinite += nonfinite
+
+    def mean(self) -> np.ndarray:
+        """The mean so far, float32; black where no pass was finite."""
+        return (self.total / np.maximum(self.weight, 1.0)).astype(np.float32)
+
+
+class Moments(Accumulator):
+    """Sample-weighted mean of passes, and the variance *of that mean* from the spread between the passes.
+
+    Passes are independent, and a pass of n samples a pixel has variance σ²/n. With K passes and N samples in all,
+
+        E[ Σ n (pass - mean)² ] = (K - 1) σ²,        variance of the mean = σ²/N,
+
+    so that passes of different sizes count as they should. Two sets of passes are merged by :meth:`merge` (Chan, Golub,
+    LeVeque 1983): whichever way passes are divided among workers, mean and variance are the same. A sampler that
+    stratifies the samples of a pass is allowed for, since only whole passes are compared. A pixel that is not finite in
+    a pass is left out of that pass.
+
+    n_passes  number of passes that count, shape (height, width, 1)
+    squares   Σ n (pass - mean)², shape (height, width, channels)
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_passes: np.ndarray | None = None
+        self.squares: np.ndarray | None = None
+
+    def add(self, image: np.ndarray, spp: int) -> None:
+        one = Moments()
+        Accumulator.add(one, image, spp)
+        one.n_passes, one.squares = (one.weight > 0).astype(np.float64), np.zeros_like(one.total)
+        self.merge(one)
+
+    def replace(self, image: np.ndarray, spp: int) -> None:
+        raise TypeError("the spread of passes cannot be taken from an image that stands for all of them")
+
+    def merge(self, other: Moments) -> None:
+        """Add the passes of `other`, which were rendered with other random numbers."""
+        if other.total is None:
+            return
+        if self.total is None:
+            self.total, self.weight = other.total.copy(), other.weight.copy()
+            self.n_passes, self.squares = other.n_passes.copy(), other.squares.copy()
+        else:
+            weight = self.weight + other.weight
+            between = other.total / np.maximum(other.weight, 1.0) - self.total / np.maximum(self.weight, 1.0)
+            self.squares += other.squares + between**2 * (self.weight * other.weight / np.maximum(weight, 1.0))
+            self.total += other.total
+            self.weight, self.n_passes = weight, self.n_passes + other.n_passes
+        self.spp += other.spp
+        self.nonfinite += other.nonfinite
+
+    def variance(self) -> np.ndarray | None:
+        """Variance of :meth:`mean`, float32; None after fewer than two passes, infinite in pixels that had fewer."""
+        if self.n_passes is None or self.n_passes.max() < 2:
+            return None
+        scale = np.maximum(self.n_passes - 1.0, 1.0) * np.maximum(self.weight, 1.0)
+        return np.where(self.n_passes > 1, self.squares / scale, np.inf).astype(np.float32)

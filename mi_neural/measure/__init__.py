@@ -1,1 +1,0 @@
-"""What is known about the result: error metrics, EXR files, benchmarks, reports."""
