@@ -21,7 +21,7 @@ FOLDERS = {"mi_neural.integrators": "integrators", "mi_neural.emitters": "emitte
 
 # Imports go from higher to lower layers; rooms on one layer do not know one another.
 LAYERS = [
-    {"llvm", "scenes"},
+    {"llvm", "scenes", "parameters"},
     {"transport"},
     {"caches", "lights"},
     {"plan"},
