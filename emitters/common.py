@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural import plan
+from mi_neural import parameters, plan
 from mi_neural.lights.table import LightTable
 from mi_neural.render.binding import SceneWatch
 
@@ -21,8 +21,8 @@ class LightSampler(mi.Emitter):
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
-        self.scene, self.held = SceneWatch(), None
-        self.watched: list = []
+        self.scene = SceneWatch()
+        self.edits: parameters.Watch | None = None  # of the lights' parameters; None: there is nothing to choose
         self.sampler = None
         self.plan_mode = props.get("plan", "scene")
         self._check(self.plan_mode in plan.MODES,
@@ -71,14 +71,13 @@ class LightSampler(mi.Emitter):
         """
         if self.scene.changed(scene):
             self.reset()
-            self.held, self.sampler = None, None
+            self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
-            self.watched = _watch(scene) if self.plan.modelled("light_sampler") else []
-        if not self.watched:
+            self.edits = _watch(scene) if self.plan.modelled("light_sampler") else None
+        if self.edits is None:
             return None
         with dr.suspend_grad():
-            if self.held is None or any(_changed(*w, h) for w, h in zip(self.watched, self.held, strict=True)):
-                self.held = [_hold(params[name]) for params, name in self.watched]
+            if self.edits.changed():
                 table = LightTable(scene, texels=self.plan.modelled("environment_cells"))
                 chooses = table.n_lights > 1 or self.plan_mode == "everything"
                 self.sampler = self.make(scene, table) if chooses else None
@@ -118,30 +117,11 @@ class LightSampler(mi.Emitter):
         return dr.zeros(mi.Wavelength), mi.Spectrum(0)
 
 
-def _watch(scene) -> list:
-    """Parameters that the table is made of, as (parameters, name)."""
-    watched = []
+def _watch(scene) -> parameters.Watch:
+    """Of the parameters that the table is made of."""
+    pairs = []
     for emitter in scene.emitters():
         shape = emitter.get_shape()
-        params = mi.traverse(shape if shape is not None else emitter)
-        watched += [(params, name) for name in params.keys() if not name.startswith("bsdf.")]
-    return watched
-
-
-def _hold(value):
-    """A value as it is now, with its variables kept alive, so that none of their numbers is given to another."""
-    return type(value)(value) if dr.is_jit_v(value) else str(value)
-
-
-def _changed(params, name, held) -> bool:
-    value = params[name]
-    return _identity(value) != _identity(held) if dr.is_jit_v(value) else str(value) != held
-
-
-def _identity(value):
-    """The numbers and widths of an array's variables."""
-    if dr.is_tensor_v(value):
-        return _identity(value.array)
-    if not dr.is_array_v(value):  # a transformation
-        return _identity(value.matrix)
-    return (value.index, dr.width(value)) if dr.depth_v(value) == 1 else tuple(_identity(v) for v in value)
+        params = parameters.traverse(shape if shape is not None else emitter)
+        pairs += [(params, key) for key in params.keys() if not key.startswith("bsdf.")]
+    return parameters.Watch(pairs)

@@ -9,6 +9,7 @@ fixed is `given`. In the mode ``everything`` all parts are built that can be, fo
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
@@ -16,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import parameters
 from .caches.outgoing import INPUTS
 from .caches.visibility import surface_point
 from .lights.clusters import make_groups
@@ -41,6 +43,9 @@ N_POINTS = 2048
 #: Parts of an environment with an output each, where everything is built.
 EVERY_CELL = 32
 
+#: Parameters that are a roughness, as a number, a constant spectrum, or the values of a bitmap or grid.
+ROUGHNESS = re.compile(r"(^|\.)(alpha|alpha_u|alpha_v|roughness)(\.value|\.data|\.volume\.data)?$")
+
 
 @dataclass(frozen=True)
 class SceneFacts:
@@ -50,13 +55,14 @@ class SceneFacts:
     triangles     primitives of emissive meshes
     lights        what a light sampler chooses among; an emissive mesh of two triangles counts as one light
     surfaces      shapes by what they reflect: lambertian (diffuse alone), glossy, mixed (diffuse with a mirror or with
-                  holes), mirror (no smooth lobe)
+                  holes), mirror (no smooth lobe), unknown (instances, whose materials Mitsuba does not give)
     textures      shapes with a textured BSDF
-    roughness     least and largest `alpha` of BSDFs that say one; None without
+    roughness     least and largest alpha of BSDFs that have one, textures of it included; None without
     film          (width, height) in pixels; None without a sensor
     extent        longest side of the scene's box, in its unit; None where that is not finite
     sensors       their number
     media         whether a shape borders a participating medium
+    unknown_roughness   glossy shapes whose alpha cannot be read: measured materials, procedural textures, hair
     """
 
     emitters: dict[str, int]
@@ -69,6 +75,7 @@ class SceneFacts:
     extent: float | None
     sensors: int
     media: bool
+    unknown_roughness: int = 0
 
     @classmethod
     def read(cls, scene, sensor) -> SceneFacts:
@@ -78,23 +85,27 @@ class SceneFacts:
             emitters[kind] = emitters.get(kind, 0) + 1
             triangles += primitives
             lights += primitives if primitives > 2 else 1
-        surfaces, textures, alphas, known = {}, 0, [], {}
+        surfaces, textures, alphas, unknown, materials = {}, 0, [], 0, {}
         for shape in scene.shapes():
             bsdf = shape.bsdf()
             if bsdf is None:
                 continue
-            if bsdf.ptr not in known:
-                known[bsdf.ptr] = _reflects(bsdf), *_parameters(bsdf)
-            kind, textured, found = known[bsdf.ptr]
+            if shape.class_name() == "Instance":  # its own BSDF is a default one
+                kind, textured, found = "unknown", False, []
+            else:
+                if bsdf.ptr not in materials:
+                    materials[bsdf.ptr] = _material(bsdf)
+                kind, textured, found = materials[bsdf.ptr]
             surfaces[kind] = surfaces.get(kind, 0) + 1
             textures += textured
             alphas += found
+            unknown += kind in ("glossy", "unknown") and not found
         box = np.array(scene.bbox().extents(), np.float64).ravel()
         return cls(
             emitters, triangles, lights, surfaces, textures, (min(alphas), max(alphas)) if alphas else None,
             None if not hasattr(sensor, "film") else tuple(int(n) for n in sensor.film().crop_size()),
             float(box.max()) if np.isfinite(box).all() else None,
-            len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()),
+            len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()), unknown,
         )  # fmt: skip
 
     @property
@@ -133,14 +144,31 @@ def _reflects(bsdf) -> str:
     return "mixed" if flags & int(names.Delta) else "lambertian"
 
 
-def _parameters(bsdf) -> tuple[bool, list[float]]:
-    """Whether a BSDF is textured, and the values of its `alpha`."""
-    parameters = mi.traverse(bsdf)
-    values = {key: parameters[key] for key in parameters.keys()}
-    textured = {key for key, value in values.items() if dr.is_tensor_v(value)}
-    alphas = [key for key in values if {"alpha", "alpha_u", "alpha_v"} & set(key.split("."))]
-    found = [np.array(values[key], np.float64).ravel() for key in alphas if key not in textured]
-    return bool(textured), [float(v) for values in found for v in values]
+def _material(bsdf) -> tuple[str, bool, list[float]]:
+    """What a BSDF reflects, whether it is textured, and least and largest alpha, as far as they can be read."""
+    params = parameters.traverse(bsdf)
+    textures = [node for node in params.hierarchy if isinstance(node, mi.Texture)]
+    # A MeshAttribute says that it does not vary
+    textured = any(node.is_spatially_varying() or node.class_name() == "MeshAttribute" for node in textures)
+    alphas = []
+    for key in params.keys():
+        found = ROUGHNESS.search(key)
+        if found is None or (found[2] == "roughness" and _owner(params, key) not in ("Principled", "PrincipledThin")):
+            continue
+        value = params[key]
+        if isinstance(value, (int, float)) or (dr.is_array_v(value) and dr.is_float_v(value)):
+            values = np.array(value, np.float64).ravel()
+            values = values[np.isfinite(values)] ** (2 if found[2] == "roughness" else 1)
+            alphas += [float(v) for v in (values.min(), values.max())] if values.size else []
+    return _reflects(bsdf), textured, [min(alphas), max(alphas)] if alphas else []
+
+
+def _owner(params, key: str) -> str:
+    """Class of the BSDF that a parameter belongs to, by way of a texture or not."""
+    node = params.properties[key][2]
+    while isinstance(node, (mi.Texture, mi.Volume)):
+        node = params.hierarchy[node][0]
+    return node.class_name() if node is not None else ""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -355,12 +383,13 @@ def _input(name: str, facts: SceneFacts, request: Request) -> Decision:
     if facts.alike:
         why = f"all {facts.smooth} surfaces are Lambertian"
         return left_out(f"{why}, and light over reflectance is learned" if name == "albedo" else why)
-    glossy, span = facts.surfaces.get("glossy", 0), facts.roughness
     if name == "roughness":
+        glossy = facts.surfaces.get("glossy", 0) + facts.surfaces.get("unknown", 0)
         if not glossy:
             return left_out("no surface is glossy")
-        how = f", alpha {span[0]:.3g} to {span[1]:.3g}" if span else ""
-        return modelled(True, f"glossy surfaces: {glossy}{how}")
+        how = [f"alpha {facts.roughness[0]:.3g} to {facts.roughness[1]:.3g}"] if facts.roughness else []
+        how += [f"alpha unknown of {facts.unknown_roughness}"] if facts.unknown_roughness else []
+        return modelled(True, ", ".join([f"glossy surfaces: {glossy}", *how]))
     others = facts.smooth - facts.surfaces.get("lambertian", 0)
     return modelled(True, f"{others} of {facts.smooth} surfaces are not Lambertian")
 

@@ -82,6 +82,44 @@ def uniforms(n, seed=0):
     return PathSampler.make(dr.arange(mi.UInt32, n), mi.UInt32(seed))
 
 
+class CountingSampler:
+    """In the place of a PathSampler: numbers of its own, and how often each of them was used, by stream and lane."""
+
+    DRJIT_STRUCT = {"lane": object, "drawn": object, "stream": object}  # noqa: RUF012
+    MOST = 256  # numbers of a lane
+    uses: list = []  # noqa: RUF012
+    points: list = []  # noqa: RUF012
+
+    def __init__(self, lane=None, drawn=None, stream=None):
+        self.lane, self.drawn, self.stream = lane, drawn, stream
+
+    @classmethod
+    def make(cls, lane, seed=0, index=0, scramble=None, group=None):
+        n = dr.width(lane)
+        cls.uses.append(dr.zeros(mi.UInt32, n * cls.MOST))
+        return cls(dr.arange(mi.UInt32, n), dr.zeros(mi.UInt32, n), len(cls.uses) - 1)
+
+    def next_1d(self):
+        at = self.lane * self.MOST + self.drawn
+        dr.scatter_reduce(dr.ReduceOp.Add, self.uses[self.stream], mi.UInt32(1), at)
+        self.drawn = self.drawn + 1
+        return mi.sample_tea_float32(at, self.stream)
+
+    def next_2d(self):
+        x = self.next_1d()
+        return mi.Point2f(x, self.next_1d())
+
+    def stratified_2d(self, dimension: int, n: int = 1, i=0):
+        self.points.append((self.stream, dimension))
+        return mi.Point2f(mi.sample_tea_float32(self.lane, 1000 + dimension), 0.5)
+
+    @classmethod
+    def most_uses(cls) -> int:
+        """How often the number is used that is used most."""
+        counts = max((int(dr.max(uses)[0]) for uses in cls.uses), default=0)
+        return max(counts, max((cls.points.count(p) for p in cls.points), default=0))
+
+
 def mixed_lights():
     """All kinds of emitters, an environment map included."""
     scene = scene_of(MIXED, "envmap")

@@ -5,9 +5,23 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from expectation import ERROR_RATE
-from light_scenes import MIXED, at, glow, mixed_lights, place, random_triangles, row, scene_of, triangles, uniforms
+from light_scenes import (
+    MIXED,
+    CountingSampler,
+    at,
+    glow,
+    mixed_lights,
+    place,
+    random_triangles,
+    row,
+    scene_of,
+    triangles,
+    uniforms,
+)
 from scipy import stats
 
+from mi_neural import plan
+from mi_neural.caches import visibility
 from mi_neural.lights.clusters import Groups, kmeans, make_groups
 from mi_neural.lights.sampling import PowerLights, UniformLights, VisibleLights
 from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, LightTable, importance
@@ -445,7 +459,53 @@ def test_all_choices_are_defined_where_no_light_contributes(mixed):
             assert (weight == 0).all() and (pmf == 0).all() and (pmf_hit == 0).all()
 
 
-def test_uniform_numbers_after_a_choice_are_not_those_it_used(swarm):
+# ---------------------------------------------------------------- random numbers
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    monkeypatch.setattr(CountingSampler, "uses", [])
+    monkeypatch.setattr(CountingSampler, "points", [])
+    return CountingSampler
+
+
+@pytest.mark.parametrize("symbolic", [True, False])
+@pytest.mark.parametrize("name", ["uniform", "power", "clusters", "one candidate"])
+def test_no_number_is_used_twice_by_choices_one_after_another(choosers, counted, name, symbolic):
+    """By itself, in a loop, and in a loop within a loop that some lanes leave out, as in `restir_di`."""
+    sampler, n = choosers["swarm"][name], 16
+    si = place(PLACES[0][0], n)
+
+    def candidate(i, total, numbers):
+        u = numbers.next_1d()
+        choice = sampler.choose(si, si.n, mi.Bool(False), u, numbers, mi.UInt32(0), mi.Bool(True))
+        numbers = choice.sampler
+        return i + 1, total + choice.weight * numbers.next_1d(), numbers
+
+    def candidates(numbers, active):
+        _, total, numbers = dr.while_loop((mi.UInt32(0), dr.zeros(mi.Float, n), numbers),
+                                          lambda i, *_: active & (i < 2), candidate)  # fmt: skip
+        return total, numbers
+
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, symbolic):
+        _, total, numbers = candidate(mi.UInt32(0), mi.Float(0), counted.make(dr.arange(mi.UInt32, n)))
+        more, numbers = candidates(numbers, mi.Bool(True))
+        _, rest, numbers = dr.while_loop(
+            (dr.arange(mi.UInt32, n) % 2 == 0, dr.zeros(mi.Float, n), numbers), lambda new, *_: new,
+            lambda new, _, numbers: (mi.Bool(False), *candidates(numbers, new)),
+        )  # fmt: skip
+        total = total + more + rest + numbers.next_1d()
+        dr.eval(total, numbers)
+    drawn = np.array(numbers.drawn)
+    assert counted.most_uses() == 1 and np.array(counted.uses[0]).sum() == drawn.sum()
+    if name in ("uniform", "power"):  # the others draw as many as the group's candidates
+        np.testing.assert_array_equal(drawn, np.where(np.arange(n) % 2 == 0, 11, 7))
+    else:
+        assert (drawn >= 13).all()
+
+
+def test_the_sampler_that_was_given_is_advanced_too(swarm):
+    """Callers that keep theirs and not the one that comes back draw new numbers as well."""
     sampler = VisibleLights(swarm[1], make_groups(swarm[1], 6, "kmeans"), candidates=4)
     used = uniforms(16)
     u = used.next_1d()
@@ -453,3 +513,19 @@ def test_uniform_numbers_after_a_choice_are_not_those_it_used(swarm):
     after, fresh = np.array(used.next_1d()), uniforms(16)
     drawn = np.stack([np.array(fresh.next_1d()) for _ in range(9)])
     assert not (drawn == after).all(axis=1).any()
+
+
+def test_no_number_is_used_twice_where_lights_are_looked_at(mixed, counted, monkeypatch):
+    """By the plan, and for training points and shadow rays of a visibility cache."""
+    scene, table = mixed
+    camera = mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, -6, 3], [0, 0, 0],
+                                                                                            [0, 0, 1])})  # fmt: skip
+    monkeypatch.setattr(plan, "PathSampler", counted)
+    assert np.isfinite(plan.light_noise(scene, camera, n_points=64).uniform)
+    assert len(counted.uses) == 2 and counted.most_uses() == 1
+
+    monkeypatch.setattr(visibility, "PathSampler", counted)
+    monkeypatch.setattr(visibility, "_numbers", counted.make)
+    cache = visibility.VisibilityCache(visibility.VisibilityTraining(n_points=32))
+    cache.train(scene, camera, table, make_groups(table, 6), 2)
+    assert len(counted.uses) == 2 + 1 + 2 * 2 and counted.most_uses() == 1

@@ -21,7 +21,7 @@ FOLDERS = {"mi_neural.integrators": "integrators", "mi_neural.emitters": "emitte
 
 # Imports go from higher to lower layers; rooms on one layer do not know one another.
 LAYERS = [
-    {"llvm", "scenes", "estimators", "image"},
+    {"llvm", "scenes", "estimators", "image", "parameters"},
     {"render"},
     {"caches", "lights"},
     {"plan"},

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import parameters
 from .load import InputError, one_line
 
 #: New value of a parameter: function(frame, original value) -> value of the same shape.
@@ -110,7 +111,7 @@ def keys(params) -> dict[str, Callable[[], Parameter]]:
     """All that can be changed, by key: those of ``mi.traverse`` without the film, and the two kinds of our own."""
     found: dict[str, Callable[[], Parameter]] = {}
     for key, (_, _, node, _) in params.properties.items():
-        if ".film." in key:
+        if ".film." in key or parameters.read(params, key) is None:
             continue
         found[key] = lambda key=key: Parameter(params, key)
         owner, _, name = key.rpartition(".")

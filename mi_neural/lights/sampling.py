@@ -1,10 +1,10 @@
 """How a light is chosen: one interface, three ways.
 
 ``choose(si, n, transmits, u, sampler, hit, active)`` draws a light for the surface point `si` with normal `n` (a mask
-says whether light from behind counts) by the uniform number `u`, and what more it needs from `sampler`; and gives,
-beside, the probability of light `hit`. ``pmf(si, n, transmits, index, active)`` is that probability alone. Each light
-that can contribute keeps a positive probability, so every estimate made with any of them is unbiased:
-E[contribution(light) weight] = sum of all lights' contributions.
+says whether light from behind counts) by the uniform number `u`, and what more it needs from `sampler`, which comes
+back advanced, in the choice. With it comes the probability of light `hit`. ``pmf(si, n, transmits, index, active)`` is
+that probability alone. Each light that can contribute keeps a positive probability, so every estimate made with any of
+them is unbiased: E[contribution(light) weight] = sum of all lights' contributions.
 """
 
 from __future__ import annotations
@@ -33,13 +33,15 @@ class Choice:
     index    the light
     weight   what its contribution counts: 1 / pmf, or the weight of a resampled candidate, whose mean that is
     pmf      probability of the light, for MIS weights (with resampling: of it as a candidate)
-    pmf_hit  the same of the light asked for
+    pmf_hit  the same of the light `hit`
+    sampler  the sampler that was given, advanced by what was drawn
     """
 
     index: mi.UInt32
     weight: mi.Float
     pmf: mi.Float
     pmf_hit: mi.Float
+    sampler: object
 
 
 class UniformLights:
@@ -53,7 +55,7 @@ class UniformLights:
     def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:
         count = self.table.n_lights
         index = dr.minimum(mi.UInt32(u * count), count - 1)
-        return Choice(index, mi.Float(count), mi.Float(1 / count), mi.Float(1 / count))
+        return Choice(index, mi.Float(count), mi.Float(1 / count), mi.Float(1 / count), sampler)
 
     def pmf(self, si, n, transmits, index, active):
         return mi.Float(1 / self.table.n_lights)
@@ -74,7 +76,7 @@ class PowerLights:
 
     def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:
         index, pmf = self.groups.sample_light(mi.UInt32(0), u, active)
-        return Choice(index, dr.rcp(pmf), pmf, dr.gather(mi.Float, self.groups.within, hit, active))
+        return Choice(index, dr.rcp(pmf), pmf, dr.gather(mi.Float, self.groups.within, hit, active), sampler)
 
     def pmf(self, si, n, transmits, index, active):
         return dr.gather(mi.Float, self.groups.within, index, active)
@@ -128,7 +130,7 @@ class VisibleLights:
         if not self.resamples:
             index, within = self.groups.sample_light(chosen, u, active)
             pmf *= within
-            return Choice(index, dr.select(pmf > 0, dr.rcp(pmf), 0), pmf, pmf_hit * within_hit)
+            return Choice(index, dr.select(pmf > 0, dr.rcp(pmf), 0), pmf, pmf_hit * within_hit, sampler)
 
         # Within the group: stratified candidates, one of them resampled. The members of a group lie in spatial order.
         m = dr.gather(mi.UInt32, self.n_candidates, chosen, active)
@@ -148,7 +150,7 @@ class VisibleLights:
         )  # fmt: skip
         weight = dr.select(w_best > 0, w_sum * inv_m / (w_best * within), 0)
         weight = dr.select(pmf > 0, weight / pmf, 0)
-        return Choice(index, weight, pmf * within, pmf_hit * within_hit)
+        return Choice(index, weight, pmf * within, pmf_hit * within_hit, sampler)
 
     def pmf(self, si, n, transmits, index, active):
         group = dr.gather(mi.UInt32, self.groups.group_of, index, active)

@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import parameters
+
 #: Texels a side, at least and at most. The most are 6 million bytes a hundred texels a side, and 0.4 degrees a texel.
 SIZES = (32, 512)
 #: Looks at the environment that texels' shares are estimated from, half of them where it samples itself.
@@ -119,9 +121,9 @@ class Sky:
 
 def _size(environment) -> int:
     """Texels a side: as fine as the environment's bitmap, within `SIZES`."""
-    params = mi.traverse(environment)
     if environment.class_name() == "ConstantBackgroundEmitter":
         return SIZES[0]
-    rows = [params[k].shape[0] for k in params.keys() if dr.is_tensor_v(params[k]) and params[k].ndim == 3]
+    values = [value for _, value in parameters.traverse(environment)]
+    rows = [v.shape[0] for v in values if dr.is_tensor_v(v) and v.ndim == 3]
     rows = max(rows, default=SIZES[1] // 2)
     return int(np.clip(2 ** int(np.ceil(np.log2(max(rows, 1)))), *SIZES))

@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import parameters
 from . import ltc
 from .table import ENVIRONMENT, LOCAL, LightTable
 
@@ -314,24 +315,18 @@ def _glossy_materials(scene) -> _Materials:
             continue  # mirrors and the like receive nothing
         name = bsdf.class_name()
         if name == "TwoSidedBRDF":
-            # The materials of its two sides, as it prints itself: they must be one
-            inside = set(re.findall(r"^  brdf\[\d\] = (\w+)\[", str(bsdf), re.M))
-            name = inside.pop() if len(inside) == 1 and _one_sided_twice(bsdf) else "different sides"
+            inside = [n for n, (_, depth) in parameters.traverse(bsdf).hierarchy.items() if depth == 1]
+            name = inside[0].class_name() if len(inside) == 1 else "different sides"
         if name in KNOWN and (not name.startswith("Rough") or _has_alpha(bsdf)):
             known[number] = True
             coat |= name.endswith("Plastic")
             if name.startswith("Rough"):
-                params = mi.traverse(bsdf)
-                factor = BECKMANN if "distribution = beckmann" in str(bsdf) else 1.0
+                params = parameters.traverse(bsdf)
+                factor = BECKMANN if "distribution = beckmann" in parameters.text(bsdf) else 1.0
                 rough.append((number, params, _alpha_keys(params), factor))
         else:
             other = True
     return _Materials(known, rough, bool(known.any()), coat, other)
-
-
-def _one_sided_twice(bsdf) -> bool:
-    """Whether a two-sided material has the same parameters on either side."""
-    return not any(k.startswith("brdf_1.") for k in mi.traverse(bsdf).keys())
 
 
 def _alpha_keys(params) -> list[str]:
@@ -341,7 +336,7 @@ def _alpha_keys(params) -> list[str]:
 
 
 def _has_alpha(bsdf) -> bool:
-    return bool(_alpha_keys(mi.traverse(bsdf)))
+    return bool(_alpha_keys(parameters.traverse(bsdf)))
 
 
 def _alpha(params, keys) -> float:
@@ -358,7 +353,7 @@ def _only(kind) -> mi.BSDFContext:
 def _round(emitter):
     """(form, centre, two radii as vectors, radiance) of a disk or sphere of constant radiance; else None."""
     shape = emitter.get_shape()
-    params = mi.traverse(emitter)
+    params = parameters.traverse(emitter)
     if shape is None or emitter.class_name() != "AreaLight" or "radiance.value" not in params:
         return None
     radiance = np.array(mi.unpolarized_spectrum(mi.Color3f(params["radiance.value"]))).ravel()[:3]
