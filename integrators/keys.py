@@ -56,6 +56,33 @@ def register(name: str, cls) -> None:
     mi.register_integrator(name, lambda props: cls(Keys(props)))
 
 
+#: Keys of ``nirc`` that had no meaning with ``termination="auto"``, and the names of its channels in ``neural_path``.
+WITHOUT_MEANING = ("termination", "light_samples", "gather_half", "cache")
+CHANNELS_OF_NIRC = {"direct": "traced", "cache": "cached"}
+
+
+def older_name(keys: Keys):
+    """The ``neural_path`` that ``nirc`` and ``nrc`` with ``termination="auto"`` stand for; None for others."""
+    name = keys.plugin_name()
+    if name == "nrc" and keys.get("termination", "spread") not in ("spread", "auto"):
+        raise ValueError(f"nrc: termination is '{keys['termination']}'; leave it out, paths end by spread_threshold")
+    if "termination" not in keys or keys["termination"] != "auto":
+        return None
+    mi.Log(mi.LogLevel.Warn, f"mi_neural: {name} with termination='auto' is now a plugin; type: neural_path")
+    wanted = {key: keys[key] for key in keys.props.keys() if key not in WITHOUT_MEANING}
+    for key in WITHOUT_MEANING:
+        keys.get(key, None)
+    if name == "nirc":
+        if (kind := keys.get("cache", "plan")) not in ("plan", "network"):
+            raise ValueError(f"nirc: termination 'auto' needs cache 'network', not '{kind}'")
+        if "channels" in wanted:
+            names = [n.strip() for n in wanted["channels"].split(",")]
+            wanted["channels"] = ",".join(CHANNELS_OF_NIRC.get(n, n) for n in names)
+        if "learning_rate" in wanted:  # that of its incident cache
+            wanted["learning_rate"] *= 3.0
+    return mi.load_dict({"type": "neural_path", **wanted})
+
+
 SHARED_KEYS = (
     """
      * - max_depth

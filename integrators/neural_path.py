@@ -105,31 +105,6 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         )
 
 
-#: Keys of ``nirc`` that have no meaning here; with ``termination="auto"`` they had none there either.
-WITHOUT_MEANING = ("light_samples", "gather_half")
-#: What the channels of ``nirc`` are called here.
-CHANNELS_OF_NIRC = {"direct": "traced", "cache": "cached"}
-
-
-def alias(props):
-    """:class:`NeuralPathIntegrator` for ``nirc`` and ``nrc`` with ``termination="auto"``, its older name; else None."""
-    if "termination" not in props or props["termination"] != "auto":
-        return None
-    name = props.plugin_name()
-    mi.Log(mi.LogLevel.Warn, f"mi_neural: {name} with termination='auto' is now a plugin; type: neural_path")
-    if name == "nirc":
-        if (kind := props.get("cache", "plan")) not in ("plan", "network"):
-            raise ValueError(f"nirc: termination 'auto' needs cache 'network', not '{kind}'")
-        for key in WITHOUT_MEANING:
-            props.get(key, None)
-        if "channels" in props:
-            names = [n.strip() for n in props["channels"].split(",")]
-            props.props["channels"] = ",".join(CHANNELS_OF_NIRC.get(n, n) for n in names)
-        if "learning_rate" in props:
-            props.props["learning_rate"] = RATE * props["learning_rate"]
-    return NeuralPathIntegrator
-
-
 NeuralPathIntegrator.CHANNELS = {
     "traced": 3, "cached": 3, "cache": 3, "depth": 1, "share": 1, "density": 1
 }  # fmt: skip

@@ -16,8 +16,7 @@ from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.estimators import spread
 from mi_neural.integrators.common import CacheIntegrator
-from mi_neural.integrators.keys import SHARED_KEYS, register
-from mi_neural.integrators.neural_path import alias
+from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.planning import SIZES
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
@@ -394,4 +393,4 @@ NIRCIntegrator.__doc__ = (
             image = mi.render(scene, integrator=integrator, spp=16)
     """
 )
-register("nirc", lambda props: (alias(props) or NIRCIntegrator)(props))
+register("nirc", lambda props: older_name(props) or NIRCIntegrator(props))

@@ -5,8 +5,7 @@ import mitsuba as mi
 
 from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape
-from mi_neural.integrators.keys import SHARED_KEYS, register
-from mi_neural.integrators.neural_path import alias
+from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix, vertex
 from mi_neural.render.surface import scene_is_glossy, surface_of
@@ -143,4 +142,4 @@ NRCIntegrator.__doc__ = (
             image = mi.render(scene, integrator=integrator, spp=16)
     """
 )
-register("nrc", lambda props: (alias(props) or NRCIntegrator)(props))
+register("nrc", lambda props: older_name(props) or NRCIntegrator(props))
