@@ -127,6 +127,7 @@ class CacheIntegrator(FilmIntegrator):
         reliability = Reliability(measure=measure, split_normals=by_normal)
         self.cache = IncidentCache(training, shape, seed=self.seed, blend=blend, reliability=reliability)
         self.state = _State()
+        self.published = None  # see _publish()
         self.reset()
 
     # -------------------------------------------------------------------------------------------------------------
@@ -158,6 +159,11 @@ class CacheIntegrator(FilmIntegrator):
         self.state.lights = other.bound_lights
         if not self.state.facts:
             self.settle(scene, self._view(sensor))
+
+    def forget_scene(self) -> None:
+        """Forget what was measured of the scene that was bound, and what was recorded for it."""
+        self.film_state.forget_scene()
+        self.state.facts = {}
 
     @property
     def bound_lights(self):
@@ -207,6 +213,7 @@ class CacheIntegrator(FilmIntegrator):
             learn = (train and not self.state.image_open) or not self.state.facts
             with dr.suspend_grad():
                 self.state.lights = self.light_sampler.lights(scene, view, train=learn)
+        self.cache.recordable = self.film_state.scene_records(scene)
         if not self.needs_cache:
             if not self.state.facts:
                 self.settle(scene, view)
@@ -233,9 +240,8 @@ class CacheIntegrator(FilmIntegrator):
             raise CacheFileError(_other_scene(*self.state.loaded[:1]))
         self.state.signature = signature
         if is_another:
-            self.film_state.forget_scene()
+            self.forget_scene()
             self.cache.clear_recordings()
-            self.state.facts = {}
 
     @property
     def caches(self) -> tuple[str, ...]:
@@ -247,6 +253,11 @@ class CacheIntegrator(FilmIntegrator):
         sensor = self._sensor(scene, sensor)
         check_scene(scene, self.plugin)
         return planning.make_plan(self, scene, sensor)
+
+    def _publish(self) -> None:
+        """Show Dr.Jit the cache as an attribute, once it no longer changes: then a function of the user's that renders
+        with this integrator can be frozen."""
+        self.published = None if self.trains else self.bound_field
 
     def _view(self, sensor):
         """What is learned with in the place of `sensor`: other rays of it each time, where it cannot be recorded."""
@@ -263,6 +274,7 @@ class CacheIntegrator(FilmIntegrator):
         self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache and self.cache.steps == 0:
             self._train_first(scene, self._view(sensor), progress)
+        self._publish()
         return self.statistics()
 
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
@@ -271,6 +283,7 @@ class CacheIntegrator(FilmIntegrator):
         self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
             self.cache.train(scene, self._view(sensor), self.state.lights, frames=frames, progress=progress)
+        self._publish()
         return self.statistics()
 
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
@@ -279,6 +292,7 @@ class CacheIntegrator(FilmIntegrator):
         self.bind(scene, sensor, train=False)
         if self.needs_cache and not self.freeze_cache:
             self.cache.train(scene, self._view(sensor), self.state.lights, seconds=seconds, progress=progress)
+        self._publish()
         return self.statistics()
 
     def train_fraction(self, seconds: float) -> float:
@@ -435,6 +449,7 @@ class CacheIntegrator(FilmIntegrator):
     render_backward = render_forward = refuse_gradients
 
     def rendered(self, spp: int) -> None:
+        self._publish()
         self.state.images += 1
         self.state.image_open = self.film_state.planned_spp is not None
 

@@ -192,7 +192,7 @@ class NIRCIntegrator(CacheIntegrator):
         """Sums over `n_light` BSDF samples that are traced: (:class:`Traced`, cache's answers, sampler)."""
         si, active, n_light = path.si, path.active, self.n_light
         here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
-        a_0 = spread.camera_spread(dr.squared_norm(si.p - path.ray.o), dr.dot(si.n, path.ray.d))
+        a_0 = spread.camera_spread(dr.square(path.length), dr.dot(si.n, path.ray.d))
         # Of these samples, so many gather what lies far: as few as the share allows, to save the others their rays
         n_gather = dr.clip(dr.ceil(mixture * n_light), 1, n_light)
 

@@ -135,7 +135,7 @@ class Mixed:
 
     def forget_scene(self) -> None:
         """Forget what was compiled for the scene that was bound."""
-        self.nirc.film_state.forget_scene()
+        self.nirc.forget_scene()
         self.compiled.clear()
 
     def plan_samples(self, spp: int | None) -> None:

@@ -7,6 +7,7 @@ made under one variant still works after a visit to another.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.util
 import sys
@@ -51,8 +52,45 @@ def register() -> None:
     mi.detail.remove_variant_callback(_on_variant)  # no effect unless called a second time
     mi.detail.add_variant_callback(_on_variant)
     llvm.check(mi.variant())
+    _own_line_last()
     if mi.variant() is not None:
         _register_for(mi.variant())
+
+
+def _own_line_last() -> None:
+    """Let the last line of an error inside of ``mi.render`` be the plugin's own.
+
+    Mitsuba hands every exception on as the cause of another, "drjit.custom(...): error while performing ...": the line
+    that says what to do is added as a note (Python 3.11 and newer).
+    """
+    import mitsuba.python.util as util
+
+    render = util.render
+    if hasattr(render, "own_line_last") or not hasattr(BaseException, "add_note"):
+        return
+
+    @functools.wraps(render)
+    def wrapped(*args, **keys):
+        try:
+            return render(*args, **keys)
+        except RuntimeError as e:
+            cause = e
+            while cause.__cause__ is not None:
+                cause = cause.__cause__
+            if cause is not e and str(cause).partition(":")[0] in _names():
+                e.add_note(str(cause))
+            raise
+
+    wrapped.own_line_last = True
+    for module in [m for n, m in sys.modules.items() if n.partition(".")[0] == "mitsuba"]:
+        if vars(module).get("render") is render:
+            module.render = wrapped
+
+
+def _names() -> set[str]:
+    from . import emitters, integrators
+
+    return {*integrators.PLUGINS, *emitters.PLUGINS}
 
 
 def plugin_names(package: ModuleType) -> tuple[str, ...]:

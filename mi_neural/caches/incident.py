@@ -178,6 +178,8 @@ class IncidentCache:
     SNAPSHOT_EVERY = 64
     #: What is trained, its sizes, and what blends its two sets of weights.
     FIELD, SHAPE, BLEND = Field, FieldShape, Blend
+    #: Whether functions of the scene can be frozen.
+    recordable = True
     #: What the mean weight of the blend is called in the statistics.
     MEASURE = "reliability"
 
@@ -229,6 +231,8 @@ class IncidentCache:
 
     def freezes(self, sensor) -> bool:
         """Whether functions of this sensor can be frozen, see :func:`can_freeze`; tried once per sensor."""
+        if not self.recordable:
+            return False
         if id(sensor) not in self._sensor_freezes:
             self._sensor_freezes[id(sensor)] = can_freeze(sensor)
         return self._sensor_freezes[id(sensor)]

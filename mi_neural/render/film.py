@@ -217,10 +217,17 @@ class Passes:
         if key not in self.recorded:
             plain = _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes)
             self.recorded[key] = dr.freeze(plain, auto_opaque=False) if record else plain
+        arguments = scene, sensor if rays is None else None, rays, lights, field, samples, offset, settings
         with undisturbed():
-            return self.recorded[key](
-                scene, sensor if rays is None else None, rays, lights, field, samples, offset, settings
-            )
+            try:
+                return self.recorded[key](*arguments)
+            except RuntimeError as e:
+                if not record or "record" not in str(e):
+                    raise
+                # Another thread made or freed something of Mitsuba's meanwhile
+                mi.Log(mi.LogLevel.Debug, f"mi_neural: a pass could not be recorded: {e}")
+                del self.recorded[key]
+                return _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes)(*arguments)
 
 
 def kind_of(sensor) -> tuple:

@@ -12,6 +12,9 @@ import mitsuba as mi
 
 #: Held while an integrator of this package renders or trains: what one thread records, another must not disturb.
 LOCK = threading.RLock()
+#: Shapes that can be part of a recorded function.
+RECORDABLE = {"Mesh", "OBJMesh", "PLYMesh", "SerializedMesh", "BlenderMesh", "Cube", "Rectangle", "Sphere", "Disk",
+              "Cylinder", "Instance", "ShapeGroup"}  # fmt: skip
 #: Whether sensors can be recorded, by their kind.
 _freezes: dict[tuple, bool] = {}
 
@@ -35,14 +38,18 @@ def _ray_of(sensor, sample):
 
 
 def can_freeze_scene(scene) -> bool:
-    """Whether Dr.Jit can freeze a function of this scene (not with an ``ellipsoidsmesh`` in Mitsuba 3.9.1)."""
-    return _records(_hit_in, scene)
+    """Whether Dr.Jit can freeze a function of this scene (not with an ``ellipsoidsmesh`` in Mitsuba 3.9.1).
+
+    Tried where there are shapes that are not known to be fine.
+    """
+    return {s.class_name() for s in scene.shapes()} <= RECORDABLE or _records(_hit_in, scene)
 
 
 def _hit_in(scene, sample):
     ray = mi.Ray3f(mi.Point3f(sample.x, sample.y, 0), mi.Vector3f(0, 0, 1))
     si = scene.ray_intersect(ray)
-    return si.t, si.n
+    bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sample.x, sample)
+    return si.t, bs.pdf, weight, si.emitter(scene).eval(si)
 
 
 def _records(function, thing) -> bool:

@@ -16,7 +16,7 @@ for `valid` (alpha), null surfaces, ``hide_emitters``, ``rr_depth`` and ``max_de
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -39,6 +39,7 @@ class PathState:
     β        throughput from the start to here
     η        relative index of refraction along the path
     depth    segments traced, the one that led here included
+    length   of them together
     ray, si  that segment, and what it met
     valid    whether the pixel is covered: what Mitsuba's film takes as alpha
     active   whether the path goes on: there is a surface, and another segment is allowed
@@ -48,6 +49,7 @@ class PathState:
     β: mi.Spectrum
     η: mi.Float
     depth: mi.UInt32
+    length: mi.Float
     ray: mi.Ray3f
     si: mi.SurfaceInteraction3f
     valid: mi.Bool
@@ -102,8 +104,9 @@ def start(ray, si, active, max_depth: int = NO_LIMIT) -> PathState:
     active = mi.Bool(active) & si.is_valid()
     valid = active & ~vertex.has_null(si.bsdf())
     return PathState(
-        mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), mi.UInt32(1), mi.Ray3f(ray), si, valid, active & (max_depth > 1)
-    )
+        mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), mi.UInt32(1), dr.select(active, si.t, 0), mi.Ray3f(ray), si, valid,
+        active & (max_depth > 1),
+    )  # fmt: skip
 
 
 def camera_vertex(integrator, scene, ray, active) -> PathState:
@@ -232,7 +235,8 @@ def advance(path: PathState, found: Bounce, max_depth: int = NO_LIMIT) -> PathSt
     depth = path.depth + 1
     valid = path.valid | (path.active & ~mi.has_flag(found.bs.sampled_type, mi.BSDFFlags.Null))
     return PathState(
-        path.L + path.β * found.direct, path.β * found.weight, path.η * found.bs.eta, depth, found.ray, found.si, valid,
+        path.L + path.β * found.direct, path.β * found.weight, path.η * found.bs.eta, depth,
+        path.length + dr.select(found.followed & found.si.is_valid(), found.si.t, 0), found.ray, found.si, valid,
         found.followed & found.si.is_valid() & (depth < max_depth),
     )  # fmt: skip
 
@@ -253,9 +257,7 @@ def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None) -> tuple:
     q = survival(path, rr_depth, share)
     u = sampler.next_1d() if u is None else u
     alive = path.active & (u < q) & (dr.max(path.β) > 0)
-    return PathState(
-        path.L, path.β * dr.rcp(dr.maximum(q, 1e-6)), path.η, path.depth, path.ray, path.si, path.valid, alive
-    ), sampler
+    return replace(path, β=path.β * dr.rcp(dr.maximum(q, 1e-6)), active=alive), sampler
 
 
 def scene_has_mirrors(scene) -> bool:
