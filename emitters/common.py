@@ -79,7 +79,7 @@ class LightSampler(mi.Emitter):
         with dr.suspend_grad():
             if self.edits.changed():
                 table = LightTable(scene, texels=self.plan.modelled("environment_cells"))
-                chooses = table.n_lights > 1 or self.plan_mode == "everything"
+                chooses = table.n_lights > 1 or self.plan_mode == "everything" or self.plan.facts.inexact
                 self.sampler = self.make(scene, table) if chooses else None
             if self.sampler is not None and train:
                 with dr.resume_grad():

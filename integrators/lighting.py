@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import check_scene, sensor_of
+from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import SceneWatch
 from mi_neural.render.film import recordable
 from mi_neural.render.frozen import LOCK
@@ -35,7 +36,7 @@ class LightSamplingIntegrator(FilmIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.light_sampler = light_sampler_of(props)
+        self.light_sampler = self.nested_sampler = light_sampler_of(props)
         self.lights = None
         self.bound = SceneWatch()
 
@@ -48,6 +49,8 @@ class LightSamplingIntegrator(FilmIntegrator):
         if not self.bound.knows(scene):
             check_scene(scene, self.plugin)
             self.film_state.forget_scene()
+            self.light_sampler = self.nested_sampler or exact_sampler(scene)
+            self.lights = None
             self.bound.changed(scene)
         self.film_state.n_bound += 1
         if self.light_sampler is not None:

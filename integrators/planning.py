@@ -8,6 +8,8 @@ from functools import partial
 import mitsuba as mi
 
 from mi_neural import plan
+from mi_neural.lights.entries import is_emissive_mesh
+from mi_neural.lights.inexact import inexact
 
 #: Keys of the network's sizes, as fields of its shape.
 SIZES = {"levels": "n_levels", "hashmap_size": "hashmap_size", "width": "width", "hidden_layers": "n_hidden"}
@@ -56,3 +58,12 @@ def fits(theirs, mine) -> bool:
     """Whether a field of shape `theirs` can take the place of one of shape `mine`: all sizes are equal. What the
     network is told of surfaces may differ, that goes with the field."""
     return replace(theirs, inputs=mine.inputs) == mine if hasattr(theirs, "inputs") else theirs == mine
+
+
+def exact_sampler(scene):
+    """A light sampler for an integrator without one, where Mitsuba's own next-event estimation is wrong; else None."""
+    emitters = scene.emitters()
+    if not any(inexact(emitter) for emitter in emitters):
+        return None
+    n = sum(e.get_shape().primitive_count() if is_emissive_mesh(e) else 1 for e in emitters)
+    return mi.load_dict({"type": "uniform_lights" if n < 3 else "power_lights"}) if n <= plan.MOST_LOOKED_AT else None

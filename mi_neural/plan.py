@@ -21,6 +21,8 @@ from . import parameters
 from .caches.outgoing import INPUTS
 from .caches.visibility import surface_point
 from .lights.clusters import make_groups
+from .lights.entries import is_emissive_mesh
+from .lights.inexact import inexact
 from .lights.sampling import VISIBILITY_FLOOR, Columns, PowerLights
 from .lights.table import ENVIRONMENT, LOCAL, LightTable, importance
 from .render.frozen import undisturbed
@@ -63,6 +65,7 @@ class SceneFacts:
     sensors       their number
     media         whether a shape borders a participating medium
     unknown_roughness   glossy shapes whose alpha cannot be read: measured materials, procedural textures, hair
+    inexact       emitters that Mitsuba itself does not sample exactly, by what keeps it (:mod:`.lights.inexact`)
     """
 
     emitters: dict[str, int]
@@ -76,11 +79,14 @@ class SceneFacts:
     sensors: int
     media: bool
     unknown_roughness: int = 0
+    inexact: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def read(cls, scene, sensor) -> SceneFacts:
-        emitters, triangles, lights = {}, 0, 0
+        emitters, triangles, lights, wrong = {}, 0, 0, {}
         for emitter in scene.emitters():
+            if why := inexact(emitter):
+                wrong[why] = wrong.get(why, 0) + 1
             kind, primitives = _kind(emitter)
             emitters[kind] = emitters.get(kind, 0) + 1
             triangles += primitives
@@ -105,8 +111,14 @@ class SceneFacts:
             emitters, triangles, lights, surfaces, textures, (min(alphas), max(alphas)) if alphas else None,
             None if not hasattr(sensor, "film") else tuple(int(n) for n in sensor.film().crop_size()),
             float(box.max()) if np.isfinite(box).all() else None,
-            len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()), unknown,
+            len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()), unknown, wrong,
         )  # fmt: skip
+
+    @property
+    def why_exact(self) -> str:
+        """Why lights are sampled by a light sampler whatever their number; empty where there is no reason."""
+        parts = [f"{n} x {why}" if n > 1 else why for why, n in self.inexact.items()]
+        return f"Mitsuba's own sampling of {', '.join(parts)} is not exact" if parts else ""
 
     @property
     def environment(self) -> bool:
@@ -124,12 +136,12 @@ class SceneFacts:
 
 
 def _kind(emitter) -> tuple[str, int]:
-    """Kind of an emitter, and the primitives of its mesh (0 where it has none)."""
+    """Kind of an emitter, and the primitives of its mesh, if each of them is a light (else 0)."""
     if emitter.is_environment():
         return "environment", 0
     shape = emitter.get_shape()
     if shape is not None:
-        return "area", int(shape.primitive_count()) if shape.is_mesh() else 0
+        return "area", int(shape.primitive_count()) if is_emissive_mesh(emitter) else 0
     if int(emitter.flags()) & int(mi.EmitterFlags.DeltaDirection):
         return "directional", 0
     return "point", 0
@@ -302,6 +314,8 @@ def of_sampler(facts: SceneFacts, request: Request) -> ScenePlan:
         plan.decisions["light_sampler"] = modelled(request.plugin, f"lights: {n}")
     elif cells and facts.environment:
         plan.decisions["light_sampler"] = modelled(request.plugin, f"parts of the environment: {cells}")
+    elif facts.inexact:
+        plan.decisions["light_sampler"] = modelled(request.plugin, facts.why_exact)
     else:
         plan.decisions["light_sampler"] = left_out(f"nothing to choose, lights: {n}")
     if not by_visibility or not plan.modelled("light_sampler"):
@@ -342,16 +356,22 @@ def _light_sampler(facts: SceneFacts, request: Request) -> Decision:
         return modelled(request.given.get("light_sampler", "nvc_lights"), f"everything; lights: {n}")
     if "light_sampler" in request.given:
         return given(request.given["light_sampler"], f"lights: {n}")
+    exact = facts.why_exact
     if n < 2:
-        return left_out(f"nothing to choose, lights: {n}")
+        return modelled("uniform_lights", exact) if exact else left_out(f"nothing to choose, lights: {n}")
     if request.look is None or n > MOST_LOOKED_AT:
-        return left_out(f"the scene's own choice among {n} lights; nest one to have another")
+        if exact and n <= MOST_LOOKED_AT:
+            return modelled("power_lights", exact)
+        own = f"the scene's own choice among {n} lights; nest one to have another"
+        return left_out(f"{own}: {exact}" if exact else own)
     noise = request.look()
     figures = f"variance of direct light, {n} lights: {noise}"
     if noise.visibility < WORTH_SHARE * min(noise.power, noise.uniform):
         return modelled("nvc_lights", figures)
     if noise.power < WORTH_POWER * noise.uniform:
         return modelled("power_lights", f"{figures}; visibility would cost what it saves")
+    if exact:
+        return modelled("power_lights" if noise.power < noise.uniform else "uniform_lights", f"{figures}; {exact}")
     return left_out(f"{figures}; the scene's uniform choice will do")
 
 

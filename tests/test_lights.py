@@ -24,9 +24,16 @@ from light_scenes import (
 
 from mi_neural.lights import table as table_module
 from mi_neural.lights.clusters import make_groups
+from mi_neural.lights.entries import CYLINDER, DISK, OTHER, PARALLELOGRAM, POINT, SPHERE, TRIANGLE
 from mi_neural.lights.sampling import PowerLights, UniformLights, VisibleLights
 from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, SHADOW_EPSILON, LightTable
 from mi_neural.render import vertex
+
+FLAT = (TRIANGLE, PARALLELOGRAM)
+
+
+def flat(columns) -> np.ndarray:
+    return np.isin(columns["form"], FLAT)
 
 
 @pytest.fixture(scope="module")
@@ -46,20 +53,23 @@ def test_every_kind_of_emitter_has_its_entries(mixed):
     kinds = {name: set(c["kind"][row(scene, table, name)].tolist()) for name in counts}
     assert kinds.pop("sun") == {DIRECTION} and kinds.pop("sky") == {ENVIRONMENT}
     assert all(k == {LOCAL} for k in kinds.values())
-    flat = {name for name in counts if c["flat"][row(scene, table, name)].all()}
-    assert flat == {"window", "box"}
+    forms = {name: set(c["form"][row(scene, table, name)].tolist()) for name in counts}
+    assert forms == {
+        "ball": {SPHERE}, "plate": {DISK}, "tube": {CYLINDER}, "spark": {POINT}, "torch": {OTHER}, "sun": {OTHER},
+        "window": {PARALLELOGRAM}, "box": {TRIANGLE}, "sky": {OTHER},
+    }  # fmt: skip
 
 
 def test_flat_entries_have_the_area_and_radiance_of_their_surface(mixed):
     scene, table = mixed
     c = table.columns
     (window,), box = row(scene, table, "window"), row(scene, table, "box")
-    assert c["area"][window] == pytest.approx(3.0, rel=1e-5) and not c["folded"][window]
+    assert c["area"][window] == pytest.approx(3.0, rel=1e-5) and c["form"][window] == PARALLELOGRAM
     np.testing.assert_allclose(c["radiance"][window], [1, 2, 3], rtol=1e-5)
     np.testing.assert_allclose(c["center"][window], [0, -3, 2], atol=1e-5)
     assert c["radius"][window] == pytest.approx(np.hypot(1.5, 0.5), rel=1e-5)
     np.testing.assert_allclose(c["area"][box], 0.18, rtol=1e-5)
-    assert c["folded"][box].all() and c["plain"][box].all()
+    assert (c["form"][box] == TRIANGLE).all() and c["plain"][box].all()
     np.testing.assert_allclose(c["intensity"][box], 5 * 0.18, rtol=1e-5)
 
 
@@ -108,7 +118,7 @@ def test_normals_point_to_where_the_light_goes(shape, scale, flip):
     light = {"type": shape, "to_world": to_world, "flip_normals": flip, "emitter": glow()}
     scene = mi.load_dict({"type": "scene", "light": light})
     c = LightTable(scene).columns
-    middle = c["corner"] + (c["edge1"] + c["edge2"]) * np.where(c["folded"], 1 / 3, 0.5)[:, None]
+    middle = c["corner"] + (c["edge1"] + c["edge2"]) * np.where(c["form"] == TRIANGLE, 1 / 3, 0.5)[:, None]
     for side, known in ((1, 1.0), (-1, 0.0)):
         n = side * c["normal"]
         ray = mi.Ray3f(mi.Point3f(*(middle + 0.01 * n).T), mi.Vector3f(*-n.T))
@@ -248,12 +258,12 @@ def test_index_of_a_ray_is_the_light_it_met(mixed, rng):
     assert set(index[emits]) >= {*row(scene, table, "ball"), *row(scene, table, "window"), *row(scene, table, "sky")}
     # Flat ones: the point lies in the entry
     p = np.array(si.p).T
-    on = emits & c["flat"][index]
+    on = emits & flat(c)[index]
     k = index[on]
     basis = np.stack([c["edge1"][k], c["edge2"][k], c["normal"][k]], -1)
     u, v, off = np.linalg.solve(basis.astype(float), (p[on] - c["corner"][k])[..., None])[..., 0].T
     assert (np.abs(off) < 1e-4).all() and (u > -1e-4).all() and (v > -1e-4).all()
-    assert (np.where(c["folded"][k], u + v, np.maximum(u, v)) < 1 + 1e-4).all()
+    assert (np.where(c["form"][k] == TRIANGLE, u + v, np.maximum(u, v)) < 1 + 1e-4).all()
     assert len(set(k)) > 4
 
 
@@ -285,12 +295,10 @@ def test_density_of_a_point_is_that_of_sampling_it(sky, rng):
     same, pdf, again, index = (np.array(v) for v in (same, pdf, again, index))
     delta = np.array(ds.delta) & np.ones(n, bool)
     c = table.columns
-    assert set(index[same]) >= {i for i in range(table.n_lights) if c["intensity"][i] > 0 and not c["flat"][i]} - set(
-        index[delta]
-    )
+    assert set(index[same]) >= set(np.flatnonzero((c["intensity"] > 0) & ~flat(c))) - set(index[delta])
     assert same.sum() > 500
     off = np.abs(again[same] / pdf[same] - 1)
-    assert off[c["flat"][index[same]]].max() < 2e-2
+    assert off[flat(c)[index[same]]].max() < 2e-2
     assert np.median(off) < 1e-5 and (off > 2e-2).mean() < 2e-3  # grazing hits of spheres and cylinders are inexact
     Le = np.array(si_light.emitter(scene).eval(si_light, mi.Bool(same)))
     np.testing.assert_allclose((np.array(weight) * pdf)[:, same], Le[:, same], rtol=1e-2)
@@ -347,17 +355,20 @@ def test_mean_of_samples_of_a_spotted_picture_is_its_irradiance():
 
 
 def test_lights_that_are_not_flat_are_sampled_as_their_emitter_does(mixed, rng):
+    """Where Mitsuba gives a weight; on the back of a disk or cylinder its density is positive as well."""
     scene, table = mixed
     n = 64
     si = place(rng.uniform([-2, -2, 0.2], [2, 2, 1.5], (n, 3)), n)
     u = mi.Point2f(*rng.random((2, n), np.float32))
-    for i in np.flatnonzero(~table.columns["flat"]):
+    for i in np.flatnonzero(~flat(table.columns)):
         emitter = scene.emitters()[table.columns["emitter"][i]]
         known, known_weight = emitter.sample_direction(si, u)
         ds, weight, pdf = table.sample(scene, si, mi.UInt32(int(i)), u, mi.Bool(True))
         np.testing.assert_allclose(np.array(ds.d), np.array(known.d) * np.ones((3, n)), rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(np.array(pdf), np.array(known.pdf) * np.ones(n), rtol=1e-5)
-        np.testing.assert_allclose(np.array(weight), np.array(known_weight) * np.ones((3, n)), rtol=1e-5, atol=1e-7)
+        known_weight = np.array(known_weight) * np.ones((3, n))
+        np.testing.assert_allclose(np.array(weight), known_weight, rtol=1e-4, atol=1e-7)
+        lit = known_weight.max(axis=0) > 0
+        np.testing.assert_allclose(np.array(pdf)[lit], (np.array(known.pdf) * np.ones(n))[lit], rtol=1e-4)
 
 
 def test_shadow_rays_end_on_flat_lights_and_at_the_place_of_others(mixed, rng):
@@ -371,8 +382,8 @@ def test_shadow_rays_end_on_flat_lights_and_at_the_place_of_others(mixed, rng):
     assert dr.all(some)
     np.testing.assert_allclose(np.linalg.norm(np.array(ray.d), axis=0), 1, rtol=1e-4)
     target = np.array(ray(ray.maxt / (1 - SHADOW_EPSILON))).T
-    flat = c["flat"][index]
+    on_plane = flat(c)[index]
     off = ((target - c["corner"][index]) * c["normal"][index]).sum(axis=1)
-    assert (np.abs(off[flat]) < 1e-3).all()
+    assert (np.abs(off[on_plane]) < 1e-3).all()
     near = c["kind"][index] == LOCAL
     assert (np.linalg.norm(target - c["center"][index], axis=1)[near] <= c["radius"][index][near] + 1e-3).all()

@@ -1,7 +1,7 @@
-"""One flat table of all that emits in a scene.
+"""One flat table of all that emits in a scene, and how its entries are sampled.
 
 An entry is a *light*: a triangle or parallelogram of an emissive mesh, or a whole emitter of any other kind (sphere,
-disk, point, spot, directional, environment, ...). Entries are made with vectorised calls, whatever their number.
+disk, point, spot, directional, environment, ...).
 """
 
 from __future__ import annotations
@@ -12,31 +12,49 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render import vertex
-from .sky import REACH, Sky
+from .entries import (
+    CYLINDER,
+    CYLINDER_INSIDE,
+    CYLINDERS,
+    DIRECTION,
+    DISK,
+    ENVIRONMENT,
+    FEW,
+    LOCAL,
+    OTHER,
+    PARALLELOGRAM,
+    PLANE,
+    POINT,
+    SPHERE,
+    TRIANGLE,
+    UNSAMPLED,
+    cylinder_point,
+    interaction,
+    is_emissive_mesh,
+    make_columns,
+    seen_from,
+    with_texels,
+)
 
 #: More entries than this are refused: 100 bytes each, besides what building them takes.
 MAX_LIGHTS = 2**24
-#: Samples of an emitter's light or place that its entry is made from.
-PROBES = 16
-
 #: Shadow rays end this share of their length before the light, so that the light itself is not in the way.
 SHADOW_EPSILON = 1e-3
 
-LOCAL, DIRECTION, ENVIRONMENT = range(3)
-
 
 class LightTable:
-    """What emits, as arrays of `size` entries (structure of arrays; a PyTree).
+    """What emits, as arrays of `n_lights` entries (structure of arrays; a PyTree).
 
     emitter   index into the scene's emitters
-    flat      whether the entry is a triangle or parallelogram, sampled here; others are sampled by their emitter
-    corner, edge1, edge2, normal   of flat ones: points ``corner + u edge1 + v edge2``; unit normal, on the emitting
-                                   side
-    folded    of flat ones: a triangle, points have u + v <= 1
+    form      how the entry is sampled: TRIANGLE, PARALLELOGRAM, DISK, CYLINDER (CYLINDER_INSIDE: light leaves inwards):
+              uniformly by area; SPHERE: uniformly by solid angle; POINT; OTHER: as its emitter does, texels of the
+              environment apart; UNSAMPLED: shapes that Mitsuba cannot sample, whose light BSDF samples alone find
+    corner, edge1, edge2, normal   of planes: points ``corner + u edge1 + v edge2``, with u + v <= 1 in a triangle and
+              u² + v² <= 1 in a disk; unit normal, on the emitting side. Of cylinders ``corner + cos φ edge1 + sin φ
+              edge2 + z normal``
     prim      primitive of the emitter's shape
-    area      of flat ones; 0 elsewhere
-    radiance  mean emitted radiance of flat ones
+    area      of what is sampled by area, and of spheres; 0 elsewhere
+    radiance  mean emitted radiance of all these, intensity of points
     plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is
     kind      LOCAL, DIRECTION or ENVIRONMENT (as a whole; its texels are of kind DIRECTION)
     center, radius   bounding sphere of a LOCAL entry; DIRECTION: `center` is the direction towards the light
@@ -44,49 +62,43 @@ class LightTable:
                      DIRECTION: `cone` is the cosine of the largest angle of its directions to `center`
     intensity        LOCAL: radiance times area, or radiant intensity; else irradiance of a surface that faces the light
 
-    `n_lights` etc. are Python numbers; `facts` are all of them, for which a frozen function is recorded anew. `first`,
-    `stride` lead from an emitter's registry number and a primitive to an entry.
+    `n_lights`, `forms`, `kinds` etc. are Python values; a frozen function is recorded anew where `facts`, all of them,
+    differ. `first`, `stride` lead from an emitter's registry number and a primitive to an entry.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
-        "emitter": object, "flat": object, "corner": object, "edge1": object, "edge2": object, "normal": object,
-        "folded": object, "prim": object, "area": object, "radiance": object, "plain": object, "kind": object,
-        "center": object, "radius": object, "axis": object, "cone": object, "intensity": object,
-        "first": object, "stride": object, "facts": object,
+        "emitter": object, "form": object, "corner": object, "edge1": object, "edge2": object, "normal": object,
+        "prim": object, "area": object, "radiance": object, "plain": object, "kind": object, "center": object,
+        "radius": object, "axis": object, "cone": object, "intensity": object, "first": object, "stride": object,
+        "facts": object,
     }  # fmt: skip
 
     def __init__(self, scene, seed: int = 0, texels: bool = False):
-        emitters = scene.emitters_dr()
-        n_emitters = dr.width(emitters)
+        emitters = scene.emitters()
         rng = np.random.default_rng(seed)
-        shapes = emitters.get_shape()
-        is_mesh = np.array(shapes.is_mesh() & (dr.reinterpret_array(mi.UInt32, shapes) > 0)) & np.ones(n_emitters, bool)
-        counts = np.array(
-            [e.get_shape().primitive_count() if m else 1 for e, m in zip(scene.emitters(), is_mesh, strict=True)]
-        )
+        counts = np.array([e.get_shape().primitive_count() if is_emissive_mesh(e) else 1 for e in emitters], np.int64)
         if counts.sum() > MAX_LIGHTS:
             raise ValueError(
                 f"the scene has {counts.sum()} emissive triangles, more than the light table holds ({MAX_LIGHTS}); "
                 "leave the light_sampler out, or make the emissive meshes simpler"
             )
-        columns = _meshes(emitters, shapes, counts, is_mesh, rng)
-        _others(columns, scene, emitters, rng)
-        self.sky = None
+        columns = make_columns(scene, emitters, counts, rng)
+        self.sky, self.n_emitters = None, len(emitters)
         if texels and (columns["kind"] == ENVIRONMENT).any():
-            columns, self.sky = _texels(columns, scene, seed)
+            columns, self.sky = with_texels(columns, scene, seed)
         self.assign(columns)
 
-        ids = np.array(dr.reinterpret_array(mi.UInt32, emitters)).ravel()
+        ids = np.array(dr.reinterpret_array(mi.UInt32, scene.emitters_dr())).ravel()
         first, stride = np.zeros(ids.max(initial=0) + 1, np.uint32), np.zeros(ids.max(initial=0) + 1, np.uint32)
         first[ids[columns["emitter"][::-1]]] = np.arange(self.n_lights, dtype=np.uint32)[::-1]
-        stride[ids] = (np.bincount(columns["emitter"], minlength=n_emitters) > 1).astype(np.uint32)
+        stride[ids] = (np.bincount(columns["emitter"], minlength=len(emitters)) > 1).astype(np.uint32)
         self.first, self.stride = own(mi.UInt32(first)), own(mi.UInt32(stride))
         extent = np.array(scene.bbox().extents(), np.float64).ravel()
         self.cross_section = float(np.pi / 4 * (extent**2).sum()) if np.isfinite(extent).all() else 1.0
         dr.eval(self)
 
     def assign(self, columns: dict[str, np.ndarray]) -> None:
-        """Take over `columns`, NumPy arrays by name; what is known of all entries becomes a Python fact."""
+        """Take over `columns`, NumPy arrays by name; what all entries have in common becomes a Python value."""
         self.columns = columns
         self.n_lights = len(columns["emitter"])
         for name, values in columns.items():
@@ -97,13 +109,25 @@ class LightTable:
                 kinds = {"u": mi.UInt32, "b": mi.Bool, "f": mi.Float}
                 values = kinds[values.dtype.kind](values)
             setattr(self, name, own(values))
-        self.any_flat, self.all_flat = bool(columns["flat"].any()), bool(columns["flat"].all())
         n_texels = self.sky.size**2 if self.sky is not None else 0
-        self.any_other = int((~columns["flat"]).sum()) > n_texels  # sampled by their emitters
-        self.all_plain = bool((columns["plain"] | ~columns["flat"]).all())
+        form = columns["form"][: self.n_lights - n_texels]
+        self.forms = frozenset(form.tolist())
+        others = np.unique(columns["emitter"][: len(form)][form == OTHER])
+        #: Indices of the emitters that sample themselves; None where these are too many to be called one by one
+        self.others = tuple(others.tolist()) if len(others) <= FEW < self.n_emitters else None
+        self.any_flat, self.all_flat = self._has(TRIANGLE, PARALLELOGRAM), self.forms <= {TRIANGLE, PARALLELOGRAM}
+        sampled = np.isin(columns["form"], (*PLANE, *CYLINDERS, SPHERE))
+        self.all_plain = bool((columns["plain"] | ~sampled).all())
         self.kinds = sorted(set(columns["kind"].tolist()))
-        known = self.any_flat, self.all_flat, self.any_other, self.all_plain
-        self.facts = (self.n_lights, n_texels, *known, *self.kinds)
+        self.facts = (self.n_lights, n_texels, *sorted(self.forms), self.others, self.all_plain, *self.kinds)
+
+    def _has(self, *forms: int) -> bool:
+        return not self.forms.isdisjoint(forms)
+
+    def _form(self, index, active):
+        if len(self.forms) == 1:
+            return mi.UInt32(min(self.forms))
+        return dr.gather(mi.UInt32, self.form, index, active)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -117,97 +141,198 @@ class LightTable:
         beyond = self.sky.texel_of(-si.wi) if self.sky is not None else mi.UInt32(0)
         return first + stride * dr.select(si.is_valid(), si.prim_index, beyond), emits
 
+    def emitted(self, scene, si, index, active):
+        """Radiance towards ``-si.wi`` of light `index`, which a ray met at `si`."""
+        if self.sky is not None or self._has(OTHER, UNSAMPLED) or not self.all_plain:
+            return dr.select(active, si.emitter(scene, active).eval(si, active), 0)
+        front = active & (mi.Frame3f.cos_theta(si.wi) > 0)
+        return dr.gather(mi.Color3f, self.radiance, index, front)
+
     def sample(self, scene, si, index, sample, active):
         """A point on (direction to) light `index`, seen from `si`.
 
         Returns (direction sample, radiance over its density, density over solid angle). The density is 0 where the
         light does not reach `si`; of delta lights it is 1, and `ds.delta` is set. No shadow ray is traced.
         """
-        ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
-        weight, pdf = mi.Color3f(0), mi.Float(0)
-        flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
-        if self.any_flat:
-            ds, weight, pdf = self._sample_flat(scene, si, index, sample, active & flat)
-        if self.any_other:
-            other = active & ~flat & ~self._is_texel(index)
-            emitter = dr.gather(
-                mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, other), other
-            )
-            ds_other, w_other = emitter.sample_direction(si, sample, other)
-            ds = dr.select(flat, ds, ds_other) if self.any_flat else ds_other
-            weight, pdf = dr.select(flat, weight, w_other), dr.select(flat, pdf, ds_other.pdf)
+        form = self._form(index, active)
+        ds, weight, pdf = dr.zeros(mi.DirectionSample3f, dr.width(index)), mi.Color3f(0), mi.Float(0)
+        cases = []
+        if self._has(*PLANE, *CYLINDERS):
+            mine = active & _by_area(form)
+            cases.append((mine, *self._sample_area(scene, si, index, form, sample, mine)))
+        if self._has(SPHERE):
+            mine = active & (form == SPHERE)
+            cases.append((mine, *self._sample_sphere(si, index, sample, mine)))
+        if self._has(POINT):
+            mine = active & (form == POINT)
+            cases.append((mine, *self._sample_point(si, index, mine)))
+        if self._has(OTHER):
+            mine = active & (form == OTHER) & ~self._is_texel(index)
+            ds_other, w_other = self._by_emitters(scene, index, mine, lambda e, m: e.sample_direction(si, sample, m))
+            cases.append((mine, ds_other, w_other, ds_other.pdf))
         if self.sky is not None:
-            texel = active & self._is_texel(index)
-            ds_sky, w_sky = self.sky.sample(scene, si.p, index - self.sky.first, sample, texel)
-            alone = not (self.any_flat or self.any_other)
-            ds = ds_sky if alone else dr.select(texel, ds_sky, ds)
-            weight, pdf = dr.select(texel, w_sky, weight), dr.select(texel, ds_sky.pdf, pdf)
+            mine = active & self._is_texel(index)
+            ds_sky, w_sky = self.sky.sample(scene, si.p, index - self.sky.first, sample, mine)
+            cases.append((mine, ds_sky, w_sky, ds_sky.pdf))
+        for k, (mine, ds_one, w_one, pdf_one) in enumerate(cases):
+            ds = dr.select(mine, ds_one, ds) if k else ds_one
+            weight, pdf = dr.select(mine, w_one, weight), dr.select(mine, pdf_one, pdf)
         return ds, dr.select(active & (pdf > 0), weight, 0), dr.select(active, pdf, 0)
 
     def _is_texel(self, index):
         return index >= self.sky.first if self.sky is not None else mi.Bool(False)
 
-    def _point(self, index, sample, active):
-        """A uniform point of flat lights, and its coordinates: (p, u, v)."""
-        u, v = sample.x, sample.y
-        fold = dr.gather(mi.Bool, self.folded, index, active) & (u + v > 1)
-        u, v = dr.select(fold, 1 - u, u), dr.select(fold, 1 - v, v)
-        corner, edge1, edge2 = (dr.gather(mi.Vector3f, a, index, active) for a in (self.corner, self.edge1, self.edge2))
-        return mi.Point3f(corner + u * edge1 + v * edge2), u, v
+    def _by_emitters(self, scene, index, active, call):
+        """``call(emitter, active)`` for the emitter of each entry."""
+        which = dr.gather(mi.UInt32, self.emitter, index, active)
+        if self.others is None:
+            return call(dr.gather(mi.EmitterPtr, scene.emitters_dr(), which, active), active)
+        emitters, result = scene.emitters(), None
+        for k in self.others:
+            mine = active & (which == k)
+            one = call(emitters[k], mine)
+            result = one if result is None else dr.select(mine, one, result)
+        return result
 
-    def _sample_flat(self, scene, si, index, sample, active):
-        p, u, v = self._point(index, sample, active)
-        normal = dr.gather(mi.Vector3f, self.normal, index, active)
+    def _on_area(self, index, form, sample, active):
+        """A uniform point of what is sampled by area: (p, unit normal on the emitting side, area per unit of the
+        sample, coordinates)."""
+        take = lambda column: dr.gather(mi.Vector3f, column, index, active)  # noqa: E731
+        corner, edge1, edge2, normal = (take(c) for c in (self.corner, self.edge1, self.edge2, self.normal))
+        area = dr.gather(mi.Float, self.area, index, active)
+        uv = mi.Point2f(sample)
+        if self._has(TRIANGLE):
+            fold = (form == TRIANGLE) & (uv.x + uv.y > 1)
+            uv = dr.select(fold, 1 - uv, uv)
+        if self._has(DISK):
+            uv = dr.select(form == DISK, mi.warp.square_to_uniform_disk_concentric(sample), uv)
+        p = mi.Point3f(corner + uv.x * edge1 + uv.y * edge2)
+        if self._has(*CYLINDERS):
+            round_ = (form == CYLINDER) | (form == CYLINDER_INSIDE)
+            uv = dr.select(round_, mi.Point2f(sample.y, sample.x), uv)
+            p_round, across = cylinder_point(corner, edge1, edge2, normal, uv)
+            length = dr.norm(across)
+            side = self._side(form, edge1, edge2, normal) / dr.maximum(length, 1e-30)
+            p = dr.select(round_, p_round, p)
+            normal, area = dr.select(round_, side * across, normal), dr.select(round_, dr.two_pi * length, area)
+        return p, normal, area, uv
+
+    @staticmethod
+    def _side(form, edge1, edge2, along):
+        """1 where light leaves a cylinder along ``dp/dφ x dp/dz``, -1 where against it."""
+        right_handed = dr.dot(dr.cross(edge1, edge2), along) > 0
+        return dr.select(right_handed == (form == CYLINDER), mi.Float(1), -1)
+
+    def _sample_area(self, scene, si, index, form, sample, active):
+        p, normal, area, uv = self._on_area(index, form, sample, active)
         to_light = p - si.p
         d2 = dr.squared_norm(to_light)
         d = to_light * dr.rsqrt(dr.maximum(d2, 1e-30))
         cos = -dr.dot(d, normal)
-        area = dr.gather(mi.Float, self.area, index, active)
         pdf = dr.select(active & (cos > 0) & (area > 0), d2 / (cos * area), 0)
         ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
-        ds.p, ds.n, ds.uv, ds.d, ds.dist = p, mi.Normal3f(normal), mi.Point2f(u, v), d, dr.sqrt(d2)
+        ds.p, ds.n, ds.uv, ds.d, ds.dist = p, mi.Normal3f(normal), mi.Point2f(uv), d, dr.sqrt(d2)
         ds.pdf, ds.delta = pdf, mi.Bool(False)
         radiance = dr.gather(mi.Color3f, self.radiance, index, active)
         if not self.all_plain:
-            emitter = dr.gather(
-                mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, active), active
-            )
             varied = active & ~dr.gather(mi.Bool, self.plain, index, active)
-            at = _interaction(emitter.get_shape(), dr.gather(mi.UInt32, self.prim, index, varied), mi.Point2f(u, v),
-                              mi.Ray3f(si.p, d), varied)  # fmt: skip
+            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, varied),
+                                varied)  # fmt: skip
+            at = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+            if self._has(TRIANGLE, PARALLELOGRAM):
+                flat = varied & ((form == TRIANGLE) | (form == PARALLELOGRAM))
+                at = interaction(emitter.get_shape(), dr.gather(mi.UInt32, self.prim, index, flat), uv,
+                                 mi.Ray3f(si.p, d), flat)  # fmt: skip
+            if self._has(*CYLINDERS):
+                round_ = varied & ((form == CYLINDER) | (form == CYLINDER_INSIDE))
+                at = dr.select(round_, _surface(p, normal, uv, d, ds.dist), at)
             radiance = dr.select(varied, emitter.eval(at, varied), radiance)
         return ds, dr.select(pdf > 0, radiance / pdf, 0), pdf
 
+    def _sample_sphere(self, si, index, sample, active):
+        """Uniformly within the cone that a sphere fills, seen from outside (Shirley et al. 1996)."""
+        center = dr.gather(mi.Vector3f, self.center, index, active)
+        radius = dr.gather(mi.Float, self.radius, index, active)
+        to_center = center - si.p
+        distance, sin2_max, one_minus_cos, outside = _cone(to_center, radius)
+        outside &= active
+        # Cosine of the angle at p, then of that at the centre between the point and p
+        x = one_minus_cos * sample.x
+        sin2 = x * (2 - x)
+        sin_max = dr.sqrt(sin2_max)
+        ratio = dr.minimum(sin2 / dr.maximum(sin2_max, 1e-30), 1)
+        cos_center = dr.minimum(sin2 / dr.maximum(sin_max, 1e-30) + (1 - x) * dr.sqrt(1 - ratio), 1)
+        sin_center = dr.safe_sqrt(1 - dr.square(cos_center))
+        sin_phi, cos_phi = dr.sincos(dr.two_pi * sample.y)
+        n = mi.Frame3f(-to_center / dr.maximum(distance, 1e-30)).to_world(
+            mi.Vector3f(cos_phi * sin_center, sin_phi * sin_center, cos_center)
+        )
+        p = mi.Point3f(center + radius * n)
+        to_light = p - si.p
+        d2 = dr.squared_norm(to_light)
+        pdf = dr.select(outside, dr.inv_two_pi / dr.maximum(one_minus_cos, 1e-30), 0)
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
+        ds.p, ds.n, ds.d, ds.dist = p, mi.Normal3f(n), to_light * dr.rsqrt(dr.maximum(d2, 1e-30)), dr.sqrt(d2)
+        ds.pdf, ds.delta = pdf, mi.Bool(False)
+        radiance = dr.gather(mi.Color3f, self.radiance, index, active)
+        return ds, dr.select(outside, radiance / pdf, 0), pdf
+
+    def _sample_point(self, si, index, active):
+        p = mi.Point3f(dr.gather(mi.Vector3f, self.center, index, active))
+        to_light = p - si.p
+        d2 = dr.squared_norm(to_light)
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
+        ds.p, ds.d, ds.dist = p, to_light * dr.rsqrt(dr.maximum(d2, 1e-30)), dr.sqrt(d2)
+        ds.pdf, ds.delta = dr.select(active & (d2 > 0), mi.Float(1), 0), mi.Bool(True)
+        return ds, dr.gather(mi.Color3f, self.radiance, index, active) / dr.maximum(d2, 1e-30), ds.pdf
+
     def pdf(self, scene, si_ref, index, si_light, ds, active):
         """Density over solid angle with which `sample` would have found the point `si_light` on light `index`."""
+        form = self._form(index, active)
         pdf = mi.Float(0)
-        flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
-        if self.any_flat:
-            area = dr.gather(mi.Float, self.area, index, active & flat)
-            cos = -dr.dot(ds.d, dr.gather(mi.Vector3f, self.normal, index, active & flat))
-            pdf = dr.select((cos > 0) & (area > 0), dr.square(ds.dist) / (cos * area), 0)
-        if self.any_other:
-            other = active & ~flat & ~self._is_texel(index)
-            pdf = dr.select(flat, pdf, ds.emitter.pdf_direction(si_ref, ds, other))
+        if self._has(*PLANE, *CYLINDERS):
+            mine = active & _by_area(form)
+            area = dr.gather(mi.Float, self.area, index, mine)
+            cos = -dr.dot(ds.d, dr.gather(mi.Vector3f, self.normal, index, mine))
+            if self._has(*CYLINDERS):
+                round_ = mine & ((form == CYLINDER) | (form == CYLINDER_INSIDE))
+                edge1, edge2, along = (dr.gather(mi.Vector3f, c, index, round_) for c in (self.edge1, self.edge2,
+                                                                                         self.normal))  # fmt: skip
+                across = cylinder_point(0, edge1, edge2, along, si_light.uv)[1]
+                length = dr.norm(across)
+                facing = self._side(form, edge1, edge2, along) * dr.dot(ds.d, across) / dr.maximum(length, 1e-30)
+                cos, area = dr.select(round_, -facing, cos), dr.select(round_, dr.two_pi * length, area)
+            pdf = dr.select(mine & (cos > 0) & (area > 0), dr.square(ds.dist) / (cos * area), pdf)
+        if self._has(SPHERE):
+            mine = active & (form == SPHERE)
+            to_center = dr.gather(mi.Vector3f, self.center, index, mine) - si_ref.p
+            _, _, one_minus_cos, outside = _cone(to_center, dr.gather(mi.Float, self.radius, index, mine))
+            pdf = dr.select(mine & outside, dr.inv_two_pi / dr.maximum(one_minus_cos, 1e-30), pdf)
+        if self._has(OTHER):
+            mine = active & (form == OTHER) & ~self._is_texel(index)
+            theirs = self._by_emitters(scene, index, mine, lambda e, m: e.pdf_direction(si_ref, ds, m))
+            pdf = dr.select(mine, theirs, pdf)
         if self.sky is not None:
             pdf = dr.select(self._is_texel(index), 1 / self.sky.solid_angle, pdf)
         return dr.select(active, pdf, 0)
 
     def shadow_ray(self, scene, p, index, sample, active):
-        """A ray from the points `p` to a random point of light `index`, for a visibility test: uniform on the area of
-        flat lights, the emitter's own choice on others. Not normalised by what the point may receive."""
-        it = vertex.reference_point(p, mi.Normal3f(0, 0, 1))
-        target = mi.Point3f(p)
-        flat = dr.gather(mi.Bool, self.flat, index, active) if not self.all_flat else mi.Bool(True)
-        if self.any_flat:
-            target = self._point(index, sample, active & flat)[0]
-        if self.any_other:
-            other = active & ~flat & ~self._is_texel(index)
-            emitter = dr.gather(
-                mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, other), other
-            )
-            ds, _ = emitter.sample_direction(it, sample, other)
-            target = dr.select(flat, target, ds.p)
+        """A ray from the points `p` to a random point of light `index`, for a visibility test: as it is sampled, on its
+        back as well. Not normalised by what the point may receive."""
+        form = self._form(index, active)
+        it = seen_from(p)
+        target = mi.Point3f(dr.gather(mi.Vector3f, self.center, index, active))
+        if self._has(*PLANE, *CYLINDERS):
+            mine = active & _by_area(form)
+            target = dr.select(mine, self._on_area(index, form, sample, mine)[0], target)
+        if self._has(SPHERE):
+            mine = active & (form == SPHERE)
+            ds, _, pdf = self._sample_sphere(it, index, sample, mine)
+            target = dr.select(mine & (pdf > 0), ds.p, target)
+        if self._has(OTHER):
+            mine = active & (form == OTHER) & ~self._is_texel(index)
+            ds, _ = self._by_emitters(scene, index, mine, lambda e, m: e.sample_direction(it, sample, m))
+            target = dr.select(mine, ds.p, target)
         if self.sky is not None:
             away = p + self.sky.at(index - self.sky.first, sample) * self.sky.distance
             target = dr.select(self._is_texel(index), away, target)
@@ -216,6 +341,28 @@ class LightTable:
         ray = mi.Ray3f(p, to / dr.maximum(distance, 1e-30))
         ray.maxt = distance * (1 - SHADOW_EPSILON)
         return ray, distance > 0
+
+
+def _by_area(form):
+    return (form >= TRIANGLE) & (form <= CYLINDER_INSIDE)
+
+
+def _cone(to_center, radius):
+    """Of the cone that a sphere fills: (distance of the centre, squared sine and one minus cosine of the cone's angle,
+    whether it is seen from outside). No difference of near numbers is taken, as of the cosine of a small angle."""
+    d2 = dr.squared_norm(to_center)
+    outside = d2 > dr.square(radius * (1 + mi.math.RayEpsilon))
+    sin2 = dr.minimum(dr.square(radius) / dr.maximum(d2, 1e-30), 1)
+    return dr.sqrt(d2), sin2, sin2 / (1 + dr.sqrt(1 - sin2)), outside
+
+
+def _surface(p, normal, uv, d, distance):
+    """The surface at `p` as a ray along `d` would meet it."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    si.p, si.n, si.uv, si.t = p, mi.Normal3f(normal), uv, distance
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = si.to_local(-d)
+    return si
 
 
 def own(values):
@@ -271,199 +418,3 @@ def _widen(cos, cos_by, sin_by):
 
 def _sine(cos):
     return dr.sqrt(dr.maximum(1 - dr.square(cos), 0))
-
-
-def _texels(columns, scene, seed) -> tuple[dict[str, np.ndarray], Sky]:
-    """Columns with the texels of the environment, at the end, in the place of its one entry."""
-    row = int(np.flatnonzero(columns["kind"] == ENVIRONMENT)[0])
-    sky = Sky(scene, int(columns["emitter"][row]), seed)
-    n = sky.size**2
-    rest = np.arange(len(columns["emitter"])) != row
-    sky.first = int(rest.sum())
-    new = {k: np.repeat(v[row : row + 1], n, axis=0) for k, v in columns.items()}
-    new["prim"] = np.arange(n, dtype=np.uint32)
-    new["kind"][:] = DIRECTION
-    new["center"] = sky.direction.astype(np.float32)
-    new["intensity"] = sky.irradiance.astype(np.float32)
-    new["cone"][:] = np.cos(min(REACH / sky.size, np.pi))  # the longest half diagonal of a texel is below
-    return {k: np.concatenate([v[rest], new[k]]) for k, v in columns.items()}, sky
-
-
-def _interaction(shape, prim, uv, ray, active):
-    """The surface at barycentric or local coordinates of a primitive, seen along `ray`."""
-    pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(prim))
-    pi.t, pi.prim_uv, pi.prim_index = mi.Float(1), uv, prim
-    si = shape.compute_surface_interaction(ray, pi, mi.RayFlags.All, active)
-    si.wi = si.to_local(-ray.d)
-    return si
-
-
-def _meshes(emitters, shapes, counts, is_mesh, rng) -> dict[str, np.ndarray]:
-    """Columns of all entries, those of meshes filled in."""
-    emitter = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-    n = len(emitter)
-    prim = np.arange(n, dtype=np.uint32) - np.repeat(np.cumsum(counts) - counts, counts).astype(np.uint32)
-    flat = is_mesh[emitter]
-    zeros = lambda *shape: np.zeros((n, *shape), np.float32)  # noqa: E731
-    columns = {
-        "emitter": emitter, "flat": flat, "corner": zeros(3), "edge1": zeros(3), "edge2": zeros(3), "normal": zeros(3),
-        "folded": flat.copy(), "prim": prim, "area": zeros(), "radiance": zeros(3), "plain": np.ones(n, bool),
-        "kind": np.zeros(n, np.uint32), "center": zeros(3), "radius": zeros(), "axis": zeros(3),
-        "cone": -np.ones(n, np.float32),
-        "intensity": zeros(),
-    }  # fmt: skip
-    if not flat.any():
-        return columns
-
-    # One call for all entries, their corners and PROBES points of each
-    m = int(flat.sum())
-    b = np.concatenate([np.eye(3)[:, 1:], rng.dirichlet((1, 1, 1), PROBES)[:, :2]])
-    k = len(b)
-    rows = np.repeat(np.flatnonzero(flat), k)
-    varies = np.array(emitters.flags() & int(mi.EmitterFlags.SpatiallyVarying)) > 0
-    lights = dr.gather(mi.EmitterPtr, emitters, mi.UInt32(emitter[rows]))
-    on = dr.gather(mi.ShapePtr, shapes, mi.UInt32(emitter[rows]))
-    uv = mi.Point2f(np.tile(b, (m, 1)).T.astype(np.float32))
-    ray = mi.Ray3f(dr.zeros(mi.Point3f, m * k), mi.Vector3f(0, 0, 1))
-    si = _interaction(on, mi.UInt32(prim[rows]), uv, ray, mi.Bool(True))
-    si.wi = mi.Vector3f(0, 0, 1)
-    Le = lights.eval(si, True)
-    dr.eval(si, Le)
-    wide = lambda v: np.array(v, np.float64).T.reshape(m, k, 3)  # noqa: E731
-    p, n_geo, n_sh = wide(si.p), wide(si.n), wide(si.sh_frame.n)
-    Le = wide(Le + dr.zeros(mi.Color3f, m * k))[:, 3:]
-    Le = np.where(np.isfinite(Le), Le, 0)
-    p0, p1, p2 = p[:, 0], p[:, 1], p[:, 2]
-    radiance, n_sh0 = Le.mean(axis=1), n_sh[:, 3]
-    bent = (np.abs(np.abs((n_geo * n_sh).sum(axis=-1)) - 1) > 1e-4).any(axis=1)
-    cross = np.cross(p1 - p0, p2 - p0)
-    length = np.linalg.norm(cross, axis=1)
-    normal = cross / np.maximum(length, 1e-300)[:, None]
-    # The side that emits is that of the shading normal
-    normal *= np.where((normal * n_sh0).sum(axis=1) < 0, -1, 1)[:, None]
-    constant = (Le.max(axis=1) - Le.min(axis=1)).max(axis=1) <= 1e-5 * Le.max(axis=(1, 2))
-
-    def put(name, values):
-        columns[name][flat] = values
-
-    put("corner", p0), put("edge1", p1 - p0), put("edge2", p2 - p0), put("normal", normal)
-    put("area", 0.5 * length), put("radiance", radiance)
-    put("plain", constant & ~bent & ~(varies & np.ones(len(counts), bool))[emitter[flat]])
-    center = (p0 + p1 + p2) / 3
-    put("center", center)
-    put("radius", np.sqrt(np.max([((p - center) ** 2).sum(axis=1) for p in (p0, p1, p2)], axis=0)))
-    put("axis", normal)
-    put("cone", np.where(bent, -1, 1))
-    put("intensity", radiance.mean(axis=1) * 0.5 * length)
-    return _merge_rectangles(columns, counts, is_mesh)
-
-
-def _merge_rectangles(columns, counts, is_mesh) -> dict[str, np.ndarray]:
-    """Two triangles that are all of an emitter and form a parallelogram become one entry."""
-    pair = np.flatnonzero(is_mesh & (counts == 2))
-    if not pair.size:
-        return columns
-    a = (np.cumsum(counts) - counts)[pair]
-    p = [columns["corner"], columns["corner"] + columns["edge1"], columns["corner"] + columns["edge2"]]
-    one, two = (np.stack([q[i] for q in p], axis=1).astype(np.float64) for i in (a, a + 1))
-    # The corner of the second that the first has not, and the corner of the first opposite to it
-    distance = np.linalg.norm(one[:, :, None] - two[:, None], axis=-1)
-    scale = distance.max(axis=(1, 2))
-    shared = distance < 1e-5 * scale[:, None, None]
-    lone1, lone2 = ~shared.any(axis=2), ~shared.any(axis=1)
-    ok = (lone1.sum(axis=1) == 1) & (lone2.sum(axis=1) == 1)
-    i1, i2 = lone1.argmax(axis=1), lone2.argmax(axis=1)
-    rows = np.arange(len(pair))
-    corner, opposite = one[rows, i1], two[rows, i2]
-    q1, q2 = one[rows, (i1 + 1) % 3], one[rows, (i1 + 2) % 3]
-    ok &= np.linalg.norm(q1 + q2 - corner - opposite, axis=1) < 1e-4 * scale
-    ok &= columns["plain"][a] & columns["plain"][a + 1]
-    ok &= np.abs(columns["radiance"][a] - columns["radiance"][a + 1]).max(axis=1) <= 1e-5 * columns["radiance"][a].max(
-        axis=1
-    )
-    a, corner, q1, q2 = a[ok], corner[ok], q1[ok], q2[ok]
-    c = columns
-    c["corner"][a], c["edge1"][a], c["edge2"][a] = corner, q1 - corner, q2 - corner
-    c["folded"][a] = False
-    c["area"][a] += c["area"][a + 1]
-    c["intensity"][a] += c["intensity"][a + 1]
-    c["center"][a] = (q1 + q2) / 2
-    c["radius"][a] = (
-        np.maximum(np.linalg.norm(q1 - q2, axis=1), np.linalg.norm(corner - (q1 + q2 - corner), axis=1)) / 2
-    )
-    keep = np.ones(len(c["emitter"]), bool)
-    keep[a + 1] = False
-    return {k: v[keep] for k, v in c.items()}
-
-
-def _glow(lamps, places: np.ndarray) -> np.ndarray:
-    """Radiant intensity of lamps without extent in the brightest of 1024 directions."""
-    m, k = len(places), 1024
-    i = np.arange(k) + 0.5
-    z, phi = 1 - 2 * i / k, i * np.pi * (3 - np.sqrt(5))  # a spiral of equal steps
-    r = np.sqrt(1 - z * z)
-    around = places[:, None] + np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
-    it = vertex.reference_point(mi.Point3f(around.reshape(-1, 3).T.astype(np.float32)), mi.Normal3f(0, 0, 1))
-    lamps = dr.gather(mi.EmitterPtr, lamps, dr.repeat(dr.arange(mi.UInt32, m), k))
-    _, weight = lamps.sample_direction(it, mi.Point2f(0.5), True)
-    weight = np.array(weight + dr.zeros(mi.Color3f, m * k), np.float64).T.reshape(m, k, 3)
-    return np.nan_to_num(weight, posinf=0, neginf=0).mean(axis=2).max(axis=1)
-
-
-def _others(columns, scene, emitters, rng) -> None:
-    """Fill in the entries of emitters that are not meshes, by looking at samples of their light."""
-    rows = np.flatnonzero(~columns["flat"])
-    if not rows.size:
-        return
-    m = len(rows)
-    lights = dr.gather(mi.EmitterPtr, emitters, mi.UInt32(columns["emitter"][rows]))
-    flags = np.array(lights.flags()) * np.ones(m, np.uint32)
-    environment = np.array(lights.is_environment()) & np.ones(m, bool)
-    distant = (flags & int(mi.EmitterFlags.DeltaDirection)) != 0
-    surface = (flags & int(mi.EmitterFlags.Surface)) != 0
-
-    # Where they are and what they give, seen from the middle of the scene
-    box = scene.bbox()
-    middle = np.array(box.center(), np.float64).ravel()
-    middle = middle if np.isfinite(middle).all() else np.zeros(3)
-    k = 4 * PROBES
-    u = mi.Point2f(np.tile(rng.random((k, 2)), (m, 1)).T.astype(np.float32))
-    each = dr.repeat(dr.arange(mi.UInt32, m), k)
-    lights = dr.gather(mi.EmitterPtr, lights, each)
-    n = m * k
-    away = mi.Point3f(*middle.tolist()) + dr.zeros(mi.Point3f, n)
-    ds, weight = lights.sample_direction(vertex.reference_point(away, mi.Normal3f(0, 0, 1)), u, True)
-    # Surfaces: points all over them
-    on = lights.get_shape()
-    ps = on.sample_position(mi.Float(0), u, mi.Bool(np.repeat(surface, k)))
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.p, si.n, si.uv, si.wi, si.t = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1), mi.Float(1)
-    si.sh_frame = mi.Frame3f(ps.n)
-    Le = lights.eval(si, mi.Bool(np.repeat(surface, k)))
-    area = on.surface_area()
-    dr.eval(ds.d, ds.p, weight, ps.p, ps.n, Le, area)
-
-    def probes(v):
-        return np.nan_to_num(np.array(v + dr.zeros(type(v), n), np.float64), posinf=0, neginf=0).T.reshape(m, k, 3)
-
-    irradiance = probes(weight).mean(axis=(1, 2))
-    direction = probes(ds.d).mean(axis=1)
-    points = np.where(surface[:, None, None], probes(ps.p), probes(ds.p))
-    normals = probes(ps.n)
-    area = (np.array(area, np.float64) * np.ones(n)).reshape(m, k)[:, 0]
-    center = points.mean(axis=1)
-    radius = 1.25 * np.linalg.norm(points - center[:, None], axis=-1).max(axis=1)
-    unit = direction / np.maximum(np.linalg.norm(direction, axis=-1), 1e-30)[:, None]
-    even = surface & (np.linalg.norm(normals - normals[:, :1], axis=-1).max(axis=1) < 1e-4)
-    intensity = probes(Le).mean(axis=(1, 2)) * area
-    lamp = np.flatnonzero(~surface & ~environment & ~distant)
-    if lamp.size:
-        glow = _glow(dr.gather(mi.EmitterPtr, emitters, mi.UInt32(columns["emitter"][rows[lamp]])), center[lamp])
-        # One that was dark in all directions looked at may be a narrow beam
-        intensity[lamp] = np.where(glow > 0, glow, 1e-3 * max(glow.max(), intensity.max(initial=0)))
-    columns["kind"][rows] = np.where(environment, ENVIRONMENT, np.where(distant, DIRECTION, LOCAL))
-    columns["center"][rows] = np.where(distant[:, None], unit, center)
-    columns["radius"][rows] = np.where(surface, radius, 0)
-    columns["intensity"][rows] = np.where(environment, irradiance / 4, np.where(distant, irradiance, intensity))
-    columns["axis"][rows] = np.where(even[:, None], normals[:, 0], [0, 0, 1])
-    columns["cone"][rows] = np.where(even | distant, 1, -1)

@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import parameters
-from . import ltc
+from . import entries, ltc
 from .table import ENVIRONMENT, LOCAL, LightTable
 
 TRIANGLE, PARALLELOGRAM, DISK, SPHERE, DELTA, OTHER, SKY = range(7)
@@ -100,24 +100,28 @@ class UnshadowedLights:
         c = self.table.columns
         n = self.table.n_lights
         emitters = scene.emitters()
-        form = np.where(c["flat"], np.where(c["folded"], TRIANGLE, PARALLELOGRAM), OTHER)
+        forms = {entries.TRIANGLE: TRIANGLE, entries.PARALLELOGRAM: PARALLELOGRAM, entries.DISK: DISK,
+                 entries.SPHERE: SPHERE, entries.POINT: DELTA}  # fmt: skip
+        form = np.array([forms.get(int(f), OTHER) for f in c["form"]])
         form[c["kind"] == ENVIRONMENT] = SKY
-        center, u, v, radiance = (np.zeros((n, 3), np.float32) for _ in range(4))
+        center, u, v = (np.zeros((n, 3), np.float32) for _ in range(3))
+        disk, sphere = form == DISK, form == SPHERE
+        center[disk], u[disk], v[disk] = c["corner"][disk], c["edge1"][disk], c["edge2"][disk]
+        outwards = (np.cross(u, v) * c["normal"]).sum(axis=1) >= 0
+        u, v = np.where((disk & ~outwards)[:, None], v, u), np.where((disk & ~outwards)[:, None], u, v)
+        center[sphere], u[sphere, 0] = c["center"][sphere], c["radius"][sphere]
         self.sky: list = []
-        for i in np.flatnonzero(~c["flat"]):
+        for i in np.flatnonzero((form == OTHER) | (form == SKY)):
             emitter = emitters[c["emitter"][i]]
             if form[i] == SKY:
                 self.sky = _harmonics(emitter)
             elif mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) or c["kind"][i] != LOCAL:
                 form[i] = DELTA
-            elif (found := _round(emitter)) is not None:
-                form[i], center[i], u[i], v[i], radiance[i] = found
         self.form = form
         self.center, self.u, self.v = (mi.Vector3f(np.ascontiguousarray(a.T)) for a in (center, u, v))
-        self.disk_radiance = mi.Color3f(np.ascontiguousarray(radiance.T))
         self.lists = {f: np.flatnonzero(form == f).astype(np.uint32) for f in sorted(set(form.tolist()))}
         self.members = {f: mi.UInt32(index) for f, index in self.lists.items()}
-        dr.eval(self.center, self.u, self.v, self.disk_radiance, self.sky, self.members)
+        dr.eval(self.center, self.u, self.v, self.sky, self.members)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -223,7 +227,7 @@ class UnshadowedLights:
                 corners.insert(2, corner + edge1 + edge2)
             active = active & (dr.dot(x - corner, take(t.normal)) > 0)
             return corners, dr.gather(mi.Color3f, t.radiance, index, active), active
-        radiance = dr.gather(mi.Color3f, self.disk_radiance, index, active)
+        radiance = dr.gather(mi.Color3f, t.radiance, index, active)
         centre, u, v = take(self.center), take(self.u), take(self.v)
         if form == SPHERE:
             # The circle along which it is seen edge-on: nearer than the centre, and smaller
@@ -348,32 +352,6 @@ def _only(kind) -> mi.BSDFContext:
     ctx = mi.BSDFContext()
     ctx.type_mask = kind
     return ctx
-
-
-def _round(emitter):
-    """(form, centre, two radii as vectors, radiance) of a disk or sphere of constant radiance; else None."""
-    shape = emitter.get_shape()
-    params = parameters.traverse(emitter)
-    if shape is None or emitter.class_name() != "AreaLight" or "radiance.value" not in params:
-        return None
-    radiance = np.array(mi.unpolarized_spectrum(mi.Color3f(params["radiance.value"]))).ravel()[:3]
-    if shape.class_name() == "Disk":
-        M = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
-        found = DISK, M[:3, 3], M[:3, 0], M[:3, 1], radiance
-    elif shape.class_name() == "Sphere":
-        box = shape.bbox()
-        radius = float(box.extents()[0]) / 2
-        found = SPHERE, np.array(box.center()).ravel(), np.array([radius, 0, 0]), np.zeros(3), radiance
-    else:
-        return None
-    # Turned inside out (flip_normals), it does not shine where it seems to
-    form, centre, u, v, _ = found
-    away = np.cross(u, v) if form == DISK else np.array([1.0, 0, 0])
-    away = away / max(np.linalg.norm(away), 1e-30) * 3 * np.linalg.norm(u)
-    it = dr.zeros(mi.Interaction3f)
-    it.p = mi.Point3f(*(centre + away).tolist())
-    weight = emitter.sample_direction(it, mi.Point2f(0.5, 0.5), True)[1]
-    return found if float(dr.max(weight)[0]) > 0 else None
 
 
 def _harmonics(emitter) -> list:
