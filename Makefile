@@ -7,7 +7,7 @@ STAMP  := $(VENV)/mi_neural.stamp
 TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture bench gallery gallery-pictures docs notebooks test test-notebooks stress lint clean
+.PHONY: help demo picture bench gallery gallery-pictures docs gpu notebooks test test-notebooks stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -76,6 +76,11 @@ test-notebooks: $(TESTS)  ## every notebook, shortened, two minutes
 
 stress: $(TESTS)  ## every hard case by every integrator: table in out/stress (tests/README.md); minutes, goes on where stopped
 	$(BIN)/python tests/stress.py -o out/stress
+
+gpu: $(TESTS)  ## on a machine with an NVIDIA GPU: the default tests on cuda_ad_rgb, a table of costs in out/gpu
+	mkdir -p out/gpu
+	MI_NEURAL_TEST_VARIANT=cuda_ad_rgb $(BIN)/python -m pytest -n 4 --dist worksteal > out/gpu/tests.txt; tail -n 40 out/gpu/tests.txt
+	$(BIN)/python studies/gpu_figures.py -o out/gpu
 
 notebooks: $(STAMP)  ## run all notebooks in full length and keep their outputs, minutes
 	$(BIN)/python -m pip install --quiet -e '.[denoise,notebooks]'

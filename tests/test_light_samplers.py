@@ -391,7 +391,8 @@ def test_light_that_is_dimmed_is_not_recorded_anew(key):
                 dr.eval(it.render(scene, spp=1, seed=k))
         counts.append([
             *(p.n_recordings for p in nirc_.film_state.passes.recorded.values()), nirc_.cache._frame.n_recordings,
-            *(f.n_recordings for f in plain.images.frozen.values()), plain.light_sampler.cache._step.n_recordings,
+            *(f.n_recordings for f in plain.film_state.passes.recorded.values()),
+            plain.light_sampler.cache._step.n_recordings,
         ])  # fmt: skip
     print(counts[0], counts[-1])
     assert counts[-1] == counts[3] and max(counts[-1]) <= 3
@@ -407,7 +408,7 @@ def test_frozen_image_is_the_one_that_is_not_frozen(place):
             images = [np.array(it.render(scene, seed=seed, spp=spp)) for it in (frozen, plain)]
         np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(np.array(scene.sensors()[0].film().develop()), images[1], rtol=1e-5, atol=1e-6)
-    assert [f.n_recordings for f in frozen.images.frozen.values()] == [2, 1]
+    assert [f.n_recordings for f in frozen.film_state.passes.recorded.values()] == [2, 1]
     frozen.max_depth = 1
     with dr.suspend_grad():
         assert np.array(frozen.render(scene, seed=0, spp=4)).mean() < images[1].mean()
