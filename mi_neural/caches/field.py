@@ -13,6 +13,7 @@ from drjit.opt import Adam
 
 from . import backprop, encoding, files
 from .files import FILE_VERSION, CacheFileError
+from .hash_grid import HashGrid
 
 __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedField", "Weights"]
 
@@ -22,6 +23,7 @@ LARGEST = {"n_levels": 32, "n_features": 16, "hashmap_size": 2**24, "base_resolu
 #: Points are looked up so many cells of the finest level above their surface: both sides of a thin wall are one point,
 #: and lifted they are apart (manual, 6_measured).
 LIFT = 2.0
+GRID_RATE = 1.0
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def descend(optimizer: Adam, losses, averaged: dict, learning_rate, decay) -> tu
     loss = dr.sum(dr.detach(losses))
     ok = dr.isfinite(loss)
     # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
-    optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in optimizer})
+    optimizer.set_learning_rate({k: mi.Float(learning_rate) * (GRID_RATE if k == 'grid' else 1) for k in optimizer})
     optimizer.step(eval=False, active=ok)
     optimizer.set_learning_rate({k: None for k in optimizer})
     decay = dr.select(ok, decay, 1)
@@ -165,7 +167,7 @@ class Weights:
 
     def __init__(self, shape: FieldShape, seed: int, half: bool | None = None):
         # The grid starts near 0; anything from 1e-4 to 1e-1 trained alike
-        self.grid = nn.HashGridEncoding(
+        self.grid = HashGrid(
             mi.Float, 3, n_levels=shape.n_levels, n_features_per_level=shape.n_features,
             hashmap_size=shape.hashmap_size, base_resolution=shape.base_resolution,
             per_level_scale=shape.per_level_scale, init_scale=1e-2, rng=dr.rng(seed=2 * seed),
@@ -477,7 +479,7 @@ class Field(TrainedField):
         return weights.start(self._grid_values(weights, x))
 
     def _grid_values(self, weights: Weights, x) -> list:
-        return list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        return list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
     def output(self, weights: Weights, features: list, w):
         """:meth:`raw` by any weights of this field's shape."""

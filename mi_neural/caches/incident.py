@@ -28,6 +28,7 @@ from .field import Field, FieldShape
 from .records import TrainingRecords
 from .reliability import Reliability
 from .training_paths import Suffixes, trace_training_paths
+from .voxels import Ages
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
 TARGET_MAX = 1e4
@@ -70,13 +71,13 @@ class Training:
         if not 0 < self.last_rate <= 1:
             raise ValueError(f"last_rate is {self.last_rate}; it must be greater than 0 and at most 1")
 
-    def rate(self, step: int) -> float:
-        """Learning rate of a step: a hundred steps at full speed, then falling as 1/t to `last_rate` of it."""
-        return self.learning_rate * max(self.last_rate, 1 / (1 + step / 100))
+    def rate(self, step):
+        """Learning rate after so many steps, a number or a Dr.Jit array: a hundred steps at full speed, then falling as 1/t to `last_rate` of it."""
+        return self.learning_rate * dr.maximum(self.last_rate, 1 / (1 + step / 100))
 
-    def decay(self, step: int) -> float:
-        """EMA decay of a step: the average spans the last seventh of the steps so far, at most the full horizon."""
-        return min(self.ema_decay, 1 - 1 / (0.15 * step + 1))
+    def decay(self, step):
+        """EMA decay after so many steps: the average spans the last seventh of the steps so far, at most the full horizon."""
+        return dr.minimum(self.ema_decay, 1 - 1 / (0.15 * step + 1))
 
 
 def trace_records(scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None):
@@ -201,6 +202,7 @@ class IncidentCache:
     def reset(self) -> None:
         """Forget all that was learned. Compiled kernels are kept."""
         self.field: Field | None = None
+        self.ages: Ages | None = None
         self._blend: Blend | None = None
         self.steps = 0
         self.rate_factor = 1.0
@@ -236,13 +238,21 @@ class IncidentCache:
     def _probe_plain(self, scene, sensor, lights, seed):
         return trace_records(scene, sensor, None, self.training, seed, lights)
 
-    def _frame_plain(self, scene, sensor, lights, cache, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, cache, ages, seed, rate_factor):
         with dr.suspend_grad():
             records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
             dr.eval(records, n_bad)
+            learning_rate, decay = self.pace(ages, records.position, records.valid, rate_factor)
         outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
         sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
         return *outputs, dr.count(records.valid), n_bad, sigma
+
+    def pace(self, ages: Ages, x, valid, rate_factor) -> tuple:
+        """Learning rate and decay of the average for records at x, by how long their places have been trained."""
+        age = ages.age(x, valid)
+        learning_rate, decay = self.training.rate(age) * rate_factor, mi.Float(self.training.decay(age))
+        dr.eval(learning_rate, decay)
+        return learning_rate, decay
 
     def make_field(self, low: list, high: list, scale: float):
         """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""
@@ -267,7 +277,7 @@ class IncidentCache:
             scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-30):
             scale = 1e-20  # no indirect light found: the cache answers with nothing
-        self.field = self.make_field(low, high, scale)
+        self.field, self.ages = self.make_field(low, high, scale), Ages(low, high)
         dr.eval(self.field)
 
     def train_frame(self, scene, sensor, lights=None) -> float:
@@ -278,13 +288,11 @@ class IncidentCache:
         if self._good is None:
             self._good = self.field.snapshot()
         self._step_watch.begin(*self.field.optimizers())
-        training = self.training
-        rate = training.rate(self.steps) * self.rate_factor
         frame = self._frame if self.freezes(sensor) else self._frame_plain
         with dr.resume_grad(), undisturbed():
             outputs = frame(
-                scene, sensor, lights, self.asked, mi.UInt32(self._seed(self.steps)),
-                dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
+                scene, sensor, lights, self.asked, self.ages, mi.UInt32(self._seed(self.steps)),
+                dr.opaque(mi.Float, self.rate_factor),
             )  # fmt: skip
         value, mean_target, mean_prediction, n_valid, n_bad, sigma = (v[0] for v in outputs)
         self.steps += 1
@@ -345,6 +353,7 @@ class IncidentCache:
     def adopt(self, field: Field) -> None:
         """Go on from a field that was trained before."""
         self.field, self.steps, self._good = field, field.steps, None
+        self.ages = Ages(*field.box, steps=field.steps)
 
     def _schedule(self) -> dict:
         """Numbers that steer training, apart from the field's."""
@@ -355,6 +364,7 @@ class IncidentCache:
         asked, extra, constants = self.asked, {}, None
         if isinstance(asked, Blend) and asked.grid is not None:
             extra, constants = asked.grid.arrays(), asdict(asked.grid.constants)
+        extra["ages"] = np.array(self.ages.steps)
         self.field.save(path, extra, training=self._schedule(), reliability=constants, **facts)
 
     def read(self, path) -> tuple:
@@ -376,6 +386,7 @@ class IncidentCache:
             self.history, self.levels = ([float(v) for v in found[name]] for name in ("history", "levels"))
             if not 0 < self.rate_factor <= 1:
                 raise ValueError(f"it says that the learning rate was cut to {self.rate_factor}")
+            self.ages.restore(extra.pop("ages"))
             grid = getattr(self.asked, "grid", None)
             if grid is not None and header.get("reliability") == asdict(grid.constants):
                 grid.set_arrays(extra)
@@ -388,7 +399,7 @@ class IncidentCache:
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field, self.field.checkpoint()),
+            None if self.field is None else (self.field, self.field.checkpoint(), np.array(self.ages.steps)),
             None if self._blend is None else self._blend.snapshot(),
             self.steps, self._schedule(), self._good, dict(self.statistics),
         )  # fmt: skip
@@ -399,13 +410,14 @@ class IncidentCache:
             field = self.field
             self.reset()
             field.reset()
-            self.field = field
+            self.field, self.ages = field, Ages(*field.box)
             return
         held, blend, self.steps, schedule, self._good, self.statistics = state
         self.rate_factor, self.history, self.levels = (schedule[k] for k in ("rate_factor", "history", "levels"))
         if held is not None:
-            self.field, kept = held  # training may have begun a new one
+            self.field, kept, ages = held  # training may have begun a new one
             self.field.rollback(kept)
+            self.ages.restore(ages)
             if self._blend is not None and blend is not None:
                 self._blend.restore(blend)
 

@@ -27,6 +27,7 @@ from .incident import SCALE_TRIM, IncidentCache, Training
 from .records import packed
 from .reliability import Reliability
 from .training_paths import CONTENTS, Suffixes, trace_training_paths
+from .voxels import Ages, Voxels, check_box
 
 #: Reflectances below this count as this, so that no target is divided by 0 and black surfaces have an answer.
 ALBEDO_MIN = 0.05
@@ -40,8 +41,8 @@ RATE = 3.0
 ROUGHNESS_BINS = 4
 #: What the network can be told of a surface beside its position.
 INPUTS = ("normal", "view", "albedo", "roughness")
-#: Cells along each axis of the box in which training records are counted.
-DENSITY_CELLS = 32
+#: Cells along the longest axis of the box in which training records are counted, and entries of their table.
+DENSITY_CELLS, DENSITY_ENTRIES = 32, 2**15
 #: Places that are remembered, and steps after which all earlier ones weigh as much as the next 1000.
 N_PLACES, PLACES_HORIZON = 4096, 1000
 
@@ -95,12 +96,6 @@ def reflectance(albedo):
     return dr.maximum(albedo, ALBEDO_MIN)
 
 
-def check_box(box_min: np.ndarray, box_max: np.ndarray) -> None:
-    finite = box_min.shape == box_max.shape == (3,) and np.isfinite([box_min, box_max]).all()
-    if not (finite and (box_max > box_min).all()):
-        raise ValueError(f"the box {box_min.tolist()} .. {box_max.tolist()} is empty or not finite")
-
-
 class Places:
     """Where records lay, and from where they were seen: an even sample of all steps so far, so that training can come
     back to what has left the view. A PyTree.
@@ -152,7 +147,7 @@ class OutgoingField(TrainedField):
     UNKNOWN = ("beside.places.position",)
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "scale": object,
-        "eta": object, "density": object, "places": object,
+        "eta": object, "density": object, "places": object, "voxels": object,
     }  # fmt: skip
 
     def __init__(
@@ -166,6 +161,7 @@ class OutgoingField(TrainedField):
         self.box = (box_min.tolist(), box_max.tolist())
         self.box_min = mi.Point3f(box_min.tolist())
         self.box_inv_extent = mi.Vector3f((1 / (box_max - box_min)).tolist())
+        self.voxels = Voxels(box_min, box_max, DENSITY_CELLS)
         self.given_scale = None if scale is None else float(scale)
         self.reset()
 
@@ -176,7 +172,7 @@ class OutgoingField(TrainedField):
         self._attach_optimizer()
         self.scale = mi.Float(self.given_scale or 0.0)
         self.eta = mi.Float(0.0)  # 1 - a^t: the share of the average that training has filled
-        self.density = dr.zeros(mi.Float, DENSITY_CELLS**3)  # mean training records of a step in each cell of the box
+        self.density = dr.zeros(mi.Float, DENSITY_ENTRIES)  # mean training records of a step in each cell
         self.places = Places(N_PLACES)
         self.steps = 0
         dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places)
@@ -196,7 +192,7 @@ class OutgoingField(TrainedField):
             "albedo": lambda: dr.clip(albedo, 0, 1),
             "roughness": lambda: encoding.one_blob(1 - dr.exp(-dr.maximum(roughness, 0)), ROUGHNESS_BINS),
         }
-        values = list(weights.grid(encoding.to_unit_cube(self.lift(x, n), self.box_min, self.box_inv_extent)))
+        values = list(weights.grid(encoding.in_box(self.lift(x, n), self.box_min, self.box_inv_extent)))
         for name in INPUTS:
             if name in self.shape.inputs:
                 values += list(encoded[name]())
@@ -286,13 +282,11 @@ class OutgoingField(TrainedField):
     # Where records lie
 
     def _cell(self, x):
-        unit = encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)
-        i = mi.Point3u(dr.minimum(unit * DENSITY_CELLS, DENSITY_CELLS - 1))
-        return (i.z * DENSITY_CELLS + i.y) * DENSITY_CELLS + i.x
+        return self.voxels.entry(x, DENSITY_ENTRIES)
 
     def count(self, x, valid, decay) -> None:
         """Take this step's records into `density`: ``density <- decay density + (1 - decay) count``."""
-        counted = dr.zeros(mi.Float, DENSITY_CELLS**3)
+        counted = dr.zeros(mi.Float, DENSITY_ENTRIES)
         dr.scatter_add(counted, 1, self._cell(x), valid)
         self.density = dr.lerp(counted, self.density, decay)
         dr.eval(self.density)
@@ -458,13 +452,14 @@ class OutgoingCache(IncidentCache):
         target = records.target / reflectance(records.surface.albedo)
         return records.surface.position, loss.luminance(target), records.valid
 
-    def _frame_plain(self, scene, sensor, lights, asked, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, asked, ages, seed, rate_factor):
         blend = asked if isinstance(asked, OutgoingBlend) else None
         field = blend.field if blend else asked
         with dr.suspend_grad():
             records, n_bad = trace_outgoing(scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene))
             n_valid = dr.count(records.valid)
             dr.eval(records, n_bad, n_valid)
+            learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor)
             self.note(field, records, seed, decay)
 
         def watch(y, current, usable):
@@ -507,5 +502,5 @@ class OutgoingCache(IncidentCache):
             scale = float(target[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-20):
             scale = 1e-20  # no light found: the cache answers with nothing
-        self.field = OutgoingField(low, high, self.shape, scale=scale, seed=self.seed)
+        self.field, self.ages = OutgoingField(low, high, self.shape, scale=scale, seed=self.seed), Ages(low, high)
         dr.eval(self.field)

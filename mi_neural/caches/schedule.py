@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+
 
 @dataclass(frozen=True)
 class Ramp:
@@ -32,10 +34,10 @@ class Ramp:
                 "greater than 0"
             )
 
-    def rate(self, step: int) -> float:
-        """Learning rate of a step."""
-        return self.first_rate + (self.last_rate - self.first_rate) * min(step / max(self.ramp, 1), 1.0)
+    def rate(self, step):
+        """Learning rate after so many steps, a number or a Dr.Jit array."""
+        return self.first_rate + (self.last_rate - self.first_rate) * dr.minimum(step / max(self.ramp, 1), 1.0)
 
-    def decay(self, step: int) -> float:
+    def decay(self, step):
         """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
-        return min(self.ema_decay, 1 - 1 / (step / 3 + 1))
+        return dr.minimum(self.ema_decay, 1 - 1 / (step / 3 + 1))

@@ -81,7 +81,7 @@ class VisibilityField:
         return [_sigmoid(v) for v in self.weights(self._encode(x))]
 
     def _encode(self, x) -> list:
-        return list(self.weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        return list(self.weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
     def step(self, x, visible, learning_rate, decay):
         """One step of Adam on ``mean (V(x) - visible)²``; `visible` is a tensor (n_outputs, points). Returns the loss.
