@@ -23,7 +23,6 @@ LARGEST = {"n_levels": 32, "n_features": 16, "hashmap_size": 2**24, "base_resolu
 #: Points are looked up so many cells of the finest level above their surface: both sides of a thin wall are one point,
 #: and lifted they are apart (manual, 6_measured).
 LIFT = 2.0
-GRID_RATE = 1.0
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,8 @@ class FieldShape:
 
     @property
     def n_encoded(self) -> int:
-        """Values that :meth:`Field.encode` gives for a position."""
-        return self.width
+        """Values that :meth:`Field.encode` gives for a position: the first layer's, and the shortcut's three."""
+        return self.width + 3
 
 
 def own_copy(value):
@@ -113,7 +112,7 @@ def descend(optimizer: Adam, losses, averaged: dict, learning_rate, decay) -> tu
     loss = dr.sum(dr.detach(losses))
     ok = dr.isfinite(loss)
     # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
-    optimizer.set_learning_rate({k: mi.Float(learning_rate) * (GRID_RATE if k == 'grid' else 1) for k in optimizer})
+    optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in optimizer})
     optimizer.step(eval=False, active=ok)
     optimizer.set_learning_rate({k: None for k in optimizer})
     decay = dr.select(ok, decay, 1)
@@ -252,6 +251,16 @@ class Weights:
 
     def _vector(self, values: list) -> nn.CoopVec:
         return nn.CoopVec(*[mi.Float16(v) for v in values] if self.half else values)
+
+
+def shortcut(values: list, gain: float) -> mi.Color3f:
+    """What the first three of a grid's values, those of its coarsest levels, add to the outputs past the network.
+
+    Places have the colours of their light in entries of their own then, which are learned in a few steps. Without it, a
+    room entered is learned by moving the network's biases, and the room left is forgotten: in a walk of 30 frames a
+    room relMSE 0.2 to 0.4 in the new one, above 1 in the old ones, where with it 0.02 is reached in both.
+    """
+    return mi.Color3f(*values[:3]) * gain
 
 
 class TrainedField:
@@ -397,7 +406,7 @@ class TrainedField:
 
         Raises `CacheFileError` for a file that is missing, cut short, not of such a field, or of another version.
         """
-        header, arrays = files.read(path, cls.KIND, cls.UNKNOWN)
+        header, arrays = files.read(path, cls.KIND, (*cls.UNKNOWN, "extra.ages.places.position"))
         extra = {k.removeprefix("extra."): arrays.pop(k) for k in list(arrays) if k.startswith("extra.")}
         try:
             field = cls.make(header)
@@ -430,6 +439,9 @@ class Field(TrainedField):
     """
 
     KIND, WEIGHTS = "incident", Weights
+    #: Of :func:`shortcut`. In a room lit through a door ajar, 400 steps: relMSE 0.088, 0.092, 0.097 with 0, 8, 16; two
+    #: rooms in a row, 30 steps in the second: 0.19, -, 0.005.
+    GAIN = 8.0
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
         "scale": object, "mean": object,
@@ -476,14 +488,17 @@ class Field(TrainedField):
 
     def features(self, weights: Weights, x) -> list:
         """:meth:`encode` by any weights of this field's shape."""
-        return weights.start(self._grid_values(weights, x))
+        values = self._grid_values(weights, x)
+        return [*weights.start(values), *shortcut(values, self.GAIN)]
 
     def _grid_values(self, weights: Weights, x) -> list:
         return list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
     def output(self, weights: Weights, features: list, w):
         """:meth:`raw` by any weights of this field's shape."""
-        return mi.Color3f(*weights.finish(features, encoding.direction(w, self.shape.direction_degree))) + 1
+        *started, r, g, b = features
+        values = weights.finish(started, encoding.direction(w, self.shape.direction_degree))
+        return mi.Color3f(*values) + mi.Color3f(r, g, b) + 1
 
     def answer(self, weights: Weights, features: list, w):
         """:meth:`query` by any weights of this field's shape."""
@@ -500,8 +515,9 @@ class Field(TrainedField):
         Call it once per :meth:`step`, before it.
         """
         weights = self.trainable()
-        inputs = [*self._grid_values(weights, self.lift(x, n)), *encoding.direction(w, self.shape.direction_degree)]
-        return mi.Color3f(*weights.differentiable(inputs)) + 1
+        values = self._grid_values(weights, self.lift(x, n))
+        inputs = [*values, *encoding.direction(w, self.shape.direction_degree)]
+        return mi.Color3f(*weights.differentiable(inputs)) + shortcut(values, self.GAIN) + 1
 
     def step(self, losses, learning_rate, decay):
         """One step of Adam down the gradient of the sum of `losses`, a differentiable array; then the averaged copy.

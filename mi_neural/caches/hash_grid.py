@@ -14,6 +14,8 @@ FARTHEST = 2.0**14
 #: Factors of the hash of a cell (Müller et al. 2022, eq. 4), and of that of a tile, a block of cells of a dense level.
 CELL_FACTORS = 1, 2654435761, 805459861
 TILE_FACTORS = 2097192037, 1434869437, 2165219737
+#: Tiles have at least so many digits along an axis.
+MIN_BITS = 4
 
 
 class HashGrid(nn.HashGridEncoding):
@@ -40,8 +42,8 @@ class HashGrid(nn.HashGridEncoding):
     def _tile_bits(self, level: int) -> int | None:
         """Digits of a cell's number along each axis of a tile; None: the level has no tiles, all its cells are hashed.
         """
-        # Cells of the cube have corners 0 .. resolution
-        bits = max(4, int(self._resolution(self._level_scale(level))).bit_length())
+        # Cells of the cube have corners 0 .. resolution; in tables of a few entries most tiles would share them all
+        bits = max(MIN_BITS, int(self._resolution(self._level_scale(level))).bit_length())
         return bits if 2 ** (3 * bits) <= self.hashmap_size else None
 
     def _keys(self, cell, level: int) -> list:

@@ -26,6 +26,7 @@ from .blend import Blend
 from .divergence import StepWatch, healthy
 from .field import Field, FieldShape
 from .records import TrainingRecords
+from .places import N_PLACES
 from .reliability import Reliability
 from .training_paths import Suffixes, trace_training_paths
 from .voxels import Ages
@@ -34,6 +35,8 @@ from .voxels import Ages
 TARGET_MAX = 1e4
 #: Targets are cut to this share of outliers when the scene's mean is measured.
 SCALE_TRIM = 1e-3
+#: Share of the training paths that start where records lay, if that place has left the view.
+WORLD_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,9 @@ class Training:
         return dr.minimum(self.ema_decay, 1 - 1 / (0.15 * step + 1))
 
 
-def trace_records(scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None):
+def trace_records(
+    scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None, places: tuple | None = None
+):
     """Fresh training records, and how many were left out because they were not finite.
 
     Targets end in the cache as it is queried (in nothing without one); `lights` as in ``render.path.bounce``."""
@@ -90,9 +95,9 @@ def trace_records(scene, sensor, field: Field | Blend | None, training: Training
     def from_cache(si, bsdf, active, sampler):
         return reflect(field, field.encode(si.p, vertex.facing(si)), si, bsdf, training.n_tail, sampler, active)
 
-    plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False)
+    plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False, world_share=WORLD_SHARE)
     query = from_cache if field is not None else None
-    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights)
+    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights, places)
     return traced.incident, traced.n_bad[1]
 
 
@@ -240,8 +245,12 @@ class IncidentCache:
 
     def _frame_plain(self, scene, sensor, lights, cache, ages, seed, rate_factor):
         with dr.suspend_grad():
-            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
+            plain = getattr(cache, "field", cache)
+            places = ages.left(1e-3 * dr.norm(1 / plain.box_inv_extent))
+            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights, places)
             dr.eval(records, n_bad)
+            sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x7F4A7C15)
+            ages.places.remember(records.position, records.normal, records.valid, sampler)
             learning_rate, decay = self.pace(ages, records.position, records.valid, rate_factor)
         outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
         sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
@@ -364,7 +373,7 @@ class IncidentCache:
         asked, extra, constants = self.asked, {}, None
         if isinstance(asked, Blend) and asked.grid is not None:
             extra, constants = asked.grid.arrays(), asdict(asked.grid.constants)
-        extra["ages"] = np.array(self.ages.steps)
+        extra = extra | {f"ages.{k}": v for k, v in self.ages.arrays().items()}
         self.field.save(path, extra, training=self._schedule(), reliability=constants, **facts)
 
     def read(self, path) -> tuple:
@@ -386,7 +395,8 @@ class IncidentCache:
             self.history, self.levels = ([float(v) for v in found[name]] for name in ("history", "levels"))
             if not 0 < self.rate_factor <= 1:
                 raise ValueError(f"it says that the learning rate was cut to {self.rate_factor}")
-            self.ages.restore(extra.pop("ages"))
+            self.ages.set_arrays({k.removeprefix("ages."): v for k, v in extra.items()})
+            extra = {k: v for k, v in extra.items() if not k.startswith("ages.")}
             grid = getattr(self.asked, "grid", None)
             if grid is not None and header.get("reliability") == asdict(grid.constants):
                 grid.set_arrays(extra)
@@ -399,7 +409,7 @@ class IncidentCache:
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field, self.field.checkpoint(), np.array(self.ages.steps)),
+            None if self.field is None else (self.field, self.field.checkpoint(), self.ages.arrays()),
             None if self._blend is None else self._blend.snapshot(),
             self.steps, self._schedule(), self._good, dict(self.statistics),
         )  # fmt: skip
@@ -417,7 +427,7 @@ class IncidentCache:
         if held is not None:
             self.field, kept, ages = held  # training may have begun a new one
             self.field.rollback(kept)
-            self.ages.restore(ages)
+            self.ages.set_arrays(ages)
             if self._blend is not None and blend is not None:
                 self._blend.restore(blend)
 

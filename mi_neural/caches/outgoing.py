@@ -22,8 +22,9 @@ from ..render.sampling import PathSampler
 from ..render.surface import scene_is_glossy, surface_of
 from . import encoding, loss
 from .blend import OutgoingBlend
-from .field import FieldShape, TrainedField, Weights, descend
+from .field import FieldShape, TrainedField, Weights, descend, shortcut
 from .incident import SCALE_TRIM, IncidentCache, Training
+from .places import N_PLACES, Places
 from .records import packed
 from .reliability import Reliability
 from .training_paths import CONTENTS, Suffixes, trace_training_paths
@@ -43,8 +44,6 @@ ROUGHNESS_BINS = 4
 INPUTS = ("normal", "view", "albedo", "roughness")
 #: Cells along the longest axis of the box in which training records are counted, and entries of their table.
 DENSITY_CELLS, DENSITY_ENTRIES = 32, 2**15
-#: Places that are remembered, and steps after which all earlier ones weigh as much as the next 1000.
-N_PLACES, PLACES_HORIZON = 4096, 1000
 
 
 @dataclass(frozen=True)
@@ -96,35 +95,6 @@ def reflectance(albedo):
     return dr.maximum(albedo, ALBEDO_MIN)
 
 
-class Places:
-    """Where records lay, and from where they were seen: an even sample of all steps so far, so that training can come
-    back to what has left the view. A PyTree.
-
-    position   world space; not finite: unknown
-    view       towards the viewer
-    age        steps so far, 1-wide
-    """
-
-    DRJIT_STRUCT = {"position": object, "view": object, "age": object}  # noqa: RUF012
-
-    def __init__(self, n: int):
-        self.position = dr.full(mi.Point3f, math.nan, n)
-        self.view = dr.zeros(mi.Vector3f, n)
-        self.age = mi.Float(0)
-
-    def remember(self, position, view, valid, sampler) -> None:
-        """Put random records of this step into so many random places as make all steps equally likely (reservoir
-        sampling); after a horizon, recent ones more so."""
-        self.age = self.age + 1
-        n = dr.width(valid)
-        i = dr.minimum(mi.UInt32(sampler.next_1d() * n), n - 1)
-        new = dr.gather(mi.Bool, valid, i)
-        new &= (sampler.next_1d() * dr.minimum(self.age, PLACES_HORIZON) < 1) | ~dr.isfinite(self.position.x)
-        self.position = dr.select(new, dr.gather(mi.Point3f, position, i, new), self.position)
-        self.view = dr.select(new, dr.gather(mi.Vector3f, view, i, new), self.view)
-        dr.eval(self.position, self.view, self.age)
-
-
 class OutgoingField(TrainedField):
     """Outgoing radiance as a function of position, normal, view direction, albedo and roughness, learned online.
 
@@ -143,6 +113,8 @@ class OutgoingField(TrainedField):
     """
 
     KIND = "outgoing"
+    #: Of :func:`~mi_neural.caches.field.shortcut`; as there, over `RATE`.
+    GAIN = 3.0
     BESIDE = ("density", "places.position", "places.view", "places.age")
     UNKNOWN = ("beside.places.position",)
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -201,7 +173,8 @@ class OutgoingField(TrainedField):
     def raw(self, x, n, w, albedo, roughness, averaged: bool = True):
         """The network's output: radiance over albedo and `scale`, not clamped; all inputs must be `usable`."""
         weights = self.averaged if averaged else self.current
-        return mi.Color3f(*weights(self._encode(weights, x, n, w, albedo, roughness))) + 1
+        values = self._encode(weights, x, n, w, albedo, roughness)
+        return mi.Color3f(*weights(values)) + shortcut(values, self.GAIN) + 1
 
     def query(self, x, n, w, albedo, roughness, averaged: bool = True):
         """Radiance that leaves the surface towards `w`; never negative, and 0 where an input is not `usable`."""
@@ -211,7 +184,8 @@ class OutgoingField(TrainedField):
         """:meth:`query` by any weights of this field's shape."""
         usable = self.usable(x, n, w, albedo, roughness)
         inputs = _sanitize(usable, x, n, w, albedo, roughness)
-        value = dr.maximum(mi.Color3f(*weights(self._encode(weights, *inputs))) + 1, 0)
+        values = self._encode(weights, *inputs)
+        value = dr.maximum(mi.Color3f(*weights(values)) + shortcut(values, self.GAIN) + 1, 0)
         value = value * self.scale * reflectance(inputs[3])
         return dr.select(usable & dr.all(dr.isfinite(value)), value, 0)
 
@@ -221,7 +195,8 @@ class OutgoingField(TrainedField):
     def predict(self, x, n, w, albedo, roughness):
         """What :meth:`raw` gives for the weights being trained, differentiable with respect to them."""
         weights = self.trainable()
-        return mi.Color3f(*weights.differentiable(self._encode(weights, x, n, w, albedo, roughness))) + 1
+        values = self._encode(weights, x, n, w, albedo, roughness)
+        return mi.Color3f(*weights.differentiable(values)) + shortcut(values, self.GAIN) + 1
 
     def learn(
         self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,

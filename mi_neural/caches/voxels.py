@@ -5,9 +5,14 @@ The cells go on beyond the box that they are made for, so that a camera may walk
 
 from __future__ import annotations
 
+import math
+from operator import attrgetter
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from .places import N_PLACES, Places
 
 #: Factors of the spatial hash (Müller et al. 2022, eq. 4), and one more for the direction of the normal.
 FACTORS = 1, 2654435761, 805459861, 3674653429
@@ -82,9 +87,13 @@ def cell_sums(values: list, index, active, n_entries: int) -> list:
 
 
 class Ages:
-    """How long each place has been trained: the clock of learning rates and averages. A PyTree.
+    """How long each place has been trained: the clock of learning rates and averages; and what has left the view. A
+    PyTree.
 
-    steps   of each cell, those in which a record fell into it
+    steps    of each cell, those in which a record fell into it
+    recent   of each cell, mean number of records in the latest steps
+    usual    what `recent` was at the latest records, their mean; 1-wide
+    places   where records lay
 
     A camera that has turned to places without records needs the rates of a beginning, one that sees half of what it saw
     needs something between. Each record would choose the rate of its own place; :meth:`age` is the number of steps at
@@ -92,30 +101,57 @@ class Ages:
     steps.
     """
 
-    DRJIT_STRUCT = {"voxels": object, "steps": object}  # noqa: RUF012
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "voxels": object, "steps": object, "recent": object, "usual": object, "places": object,
+    }  # fmt: skip
     RESOLUTION, N_ENTRIES = 16, 2**15
+    #: Share of `recent` that a step leaves, and how much less than is usual means that a place has left the view.
+    KEPT, RARE = 0.9, 1 / 16
 
     def __init__(self, low, high, steps: int = 0):
         self.voxels = Voxels(low, high, self.RESOLUTION)
         self.steps = dr.full(mi.Float, steps, self.N_ENTRIES)
-        dr.make_opaque(self.steps)
-
-    def restore(self, steps: np.ndarray) -> None:
-        """Go back to known `steps`. Raises ``ValueError`` for such that make no sense."""
-        if steps.shape != (self.N_ENTRIES,) or not (steps >= 0).all():
-            raise ValueError("the steps of places are not those of this grid")
-        self.steps = mi.Float(np.float32(steps))
-        dr.make_opaque(self.steps)
+        self.recent, self.usual = dr.zeros(mi.Float, self.N_ENTRIES), mi.Float(0)
+        self.places = Places(N_PLACES)
+        dr.make_opaque(self.steps, self.recent, self.usual, self.places)
 
     def age(self, x, valid):
         """``τ (1 / mean(1 / (1 + t/τ)) - 1)`` over the valid records at x, and one step more for their places. 1-wide.
         May be frozen."""
         i = self.voxels.entry(x, self.N_ENTRIES)
-        share = dr.rcp(1 + dr.gather(mi.Float, self.steps, i, valid) * (1 / HALF_KNOWN))
-        n = dr.count(valid)
-        mean = dr.sum(dr.select(valid, share, 0)) / dr.maximum(n, 1)
-        met = dr.zeros(mi.Float, self.N_ENTRIES)
-        dr.scatter(met, mi.Float(1), i, valid)
-        self.steps = self.steps + met
-        dr.eval(self.steps, mean)
-        return dr.select(n > 0, HALF_KNOWN * (dr.rcp(dr.maximum(mean, 1e-6)) - 1), 0)
+        count = dr.zeros(mi.Float, self.N_ENTRIES)
+        dr.scatter_add(count, 1, i, valid)
+        recent = dr.lerp(count, self.recent, self.KEPT)
+        share = dr.rcp(1 + self.steps * (1 / HALF_KNOWN))
+        n = dr.maximum(dr.count(valid), 1)
+        mean, usual = dr.sum(count * share) / n, dr.sum(count * recent) / n
+        self.steps = self.steps + dr.select(count > 0, mi.Float(1), 0)
+        self.recent, self.usual = recent, usual
+        dr.eval(self.steps, self.recent, self.usual, mean)
+        return dr.select(mean > 0, HALF_KNOWN * (dr.rcp(dr.maximum(mean, 1e-6)) - 1), 0)
+
+    def left(self, distance) -> tuple:
+        """The places that have left the view, for :func:`~mi_neural.caches.training_paths.first_rays`, to be looked at
+        from so far; the others are not finite."""
+        p = self.places.position
+        near = dr.gather(mi.Float, self.recent, self.voxels.entry(p, self.N_ENTRIES)) > self.RARE * self.usual
+        p = dr.select(near, math.nan, p)
+        dr.eval(p)
+        return p, self.places.view, distance
+
+    #: What training changes.
+    LEARNED = ("steps", "recent", "usual", "places.position", "places.view", "places.age")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that training has changed."""
+        return {name: np.array(attrgetter(name)(self)) for name in self.LEARNED}
+
+    def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from :meth:`arrays`. Raises ``KeyError`` or ``ValueError`` for such that make no sense."""
+        known = self.arrays()
+        if any(arrays[name].shape != known[name].shape for name in self.LEARNED) or (arrays["steps"] < 0).any():
+            raise ValueError("the steps of places are not those of this grid")
+        for name in self.LEARNED:
+            owner, attribute = (self.places, name.split(".")[1]) if "." in name else (self, name)
+            setattr(owner, attribute, type(getattr(owner, attribute))(np.float32(arrays[name])))
+        dr.make_opaque(self.steps, self.recent, self.usual, self.places)
