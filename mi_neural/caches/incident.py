@@ -25,9 +25,10 @@ from . import encoding, loss
 from .blend import Blend
 from .divergence import StepWatch, healthy
 from .field import Field, FieldShape
-from .records import TrainingRecords
 from .places import N_PLACES
+from .records import TrainingRecords
 from .reliability import Reliability
+from .schedule import pace
 from .training_paths import Suffixes, trace_training_paths
 from .voxels import Ages
 
@@ -75,11 +76,13 @@ class Training:
             raise ValueError(f"last_rate is {self.last_rate}; it must be greater than 0 and at most 1")
 
     def rate(self, step):
-        """Learning rate after so many steps, a number or a Dr.Jit array: a hundred steps at full speed, then falling as 1/t to `last_rate` of it."""
+        """Learning rate after so many steps, a number or a Dr.Jit array: a hundred steps at full speed, then falling as
+        1/t to `last_rate` of it."""
         return self.learning_rate * dr.maximum(self.last_rate, 1 / (1 + step / 100))
 
     def decay(self, step):
-        """EMA decay after so many steps: the average spans the last seventh of the steps so far, at most the full horizon."""
+        """EMA decay after so many steps: the average spans the last seventh of them, at most the full
+        horizon."""
         return dr.minimum(self.ema_decay, 1 - 1 / (0.15 * step + 1))
 
 
@@ -182,6 +185,8 @@ class IncidentCache:
     BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
+    #: Steps of a frame while the camera is in new places: 30 frames then do as much as for a cache that is new itself.
+    STEPS_IN_NEW_PLACES = 3
     #: What is trained, its sizes, and what blends its two sets of weights.
     FIELD, SHAPE, BLEND = Field, FieldShape, Blend
     #: What the mean weight of the blend is called in the statistics.
@@ -251,17 +256,14 @@ class IncidentCache:
             dr.eval(records, n_bad)
             sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x7F4A7C15)
             ages.places.remember(records.position, records.normal, records.valid, sampler)
-            learning_rate, decay = self.pace(ages, records.position, records.valid, rate_factor)
+            learning_rate, decay = self.pace(ages, records.position, records.valid, rate_factor, plain)
         outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
         sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
         return *outputs, dr.count(records.valid), n_bad, sigma
 
-    def pace(self, ages: Ages, x, valid, rate_factor) -> tuple:
-        """Learning rate and decay of the average for records at x, by how long their places have been trained."""
-        age = ages.age(x, valid)
-        learning_rate, decay = self.training.rate(age) * rate_factor, mi.Float(self.training.decay(age))
-        dr.eval(learning_rate, decay)
-        return learning_rate, decay
+    def pace(self, ages: Ages, x, valid, rate_factor, *fields) -> tuple:
+        """:func:`~mi_neural.caches.schedule.pace` of this training."""
+        return pace(self.training, ages, x, valid, rate_factor, *fields)
 
     def make_field(self, low: list, high: list, scale: float):
         """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""
@@ -290,7 +292,15 @@ class IncidentCache:
         dr.eval(self.field)
 
     def train_frame(self, scene, sensor, lights=None) -> float:
-        """Trace fresh records and take one step on them; returns the loss. Divergence is undone, see `recover`."""
+        """Trace fresh records and take one step on them, or `STEPS_IN_NEW_PLACES` where the camera has come to places
+        that were not trained before; returns the loss. Divergence is undone, see `recover`."""
+        value = self._train_step(scene, sensor, lights)
+        if self.ages is not None and self.ages.novel():
+            for _ in range(self.STEPS_IN_NEW_PLACES - 1):
+                value = self._train_step(scene, sensor, lights)
+        return value
+
+    def _train_step(self, scene, sensor, lights) -> float:
         t0 = time.perf_counter()
         if self.field is None:
             self.start(scene, sensor, lights)

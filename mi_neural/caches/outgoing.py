@@ -120,6 +120,7 @@ class OutgoingField(TrainedField):
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "scale": object,
         "eta": object, "density": object, "places": object, "voxels": object,
+        "network_share": object,
     }  # fmt: skip
 
     def __init__(
@@ -143,11 +144,13 @@ class OutgoingField(TrainedField):
         self.averaged = Weights(self.shape, self.seed)
         self._attach_optimizer()
         self.scale = mi.Float(self.given_scale or 0.0)
+        self.network_share = mi.Float(1)
         self.eta = mi.Float(0.0)  # 1 - a^t: the share of the average that training has filled
         self.density = dr.zeros(mi.Float, DENSITY_ENTRIES)  # mean training records of a step in each cell
         self.places = Places(N_PLACES)
         self.steps = 0
-        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places)
+        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places,
+                       self.network_share)  # fmt: skip
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -170,11 +173,14 @@ class OutgoingField(TrainedField):
                 values += list(encoded[name]())
         return values
 
+    def _past(self, values: list):
+        return shortcut(values[: self.shape.n_features_total], self.GAIN)
+
     def raw(self, x, n, w, albedo, roughness, averaged: bool = True):
         """The network's output: radiance over albedo and `scale`, not clamped; all inputs must be `usable`."""
         weights = self.averaged if averaged else self.current
         values = self._encode(weights, x, n, w, albedo, roughness)
-        return mi.Color3f(*weights(values)) + shortcut(values, self.GAIN) + 1
+        return mi.Color3f(*weights(values)) + self._past(values) + 1
 
     def query(self, x, n, w, albedo, roughness, averaged: bool = True):
         """Radiance that leaves the surface towards `w`; never negative, and 0 where an input is not `usable`."""
@@ -185,7 +191,7 @@ class OutgoingField(TrainedField):
         usable = self.usable(x, n, w, albedo, roughness)
         inputs = _sanitize(usable, x, n, w, albedo, roughness)
         values = self._encode(weights, *inputs)
-        value = dr.maximum(mi.Color3f(*weights(values)) + shortcut(values, self.GAIN) + 1, 0)
+        value = dr.maximum(mi.Color3f(*weights(values)) + self._past(values) + 1, 0)
         value = value * self.scale * reflectance(inputs[3])
         return dr.select(usable & dr.all(dr.isfinite(value)), value, 0)
 
@@ -196,7 +202,7 @@ class OutgoingField(TrainedField):
         """What :meth:`raw` gives for the weights being trained, differentiable with respect to them."""
         weights = self.trainable()
         values = self._encode(weights, x, n, w, albedo, roughness)
-        return mi.Color3f(*weights.differentiable(values)) + shortcut(values, self.GAIN) + 1
+        return mi.Color3f(*weights.differentiable(values)) + self._past(values) + 1
 
     def learn(
         self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,
@@ -242,7 +248,9 @@ class OutgoingField(TrainedField):
         errors = dr.select(able, errors, math.nan)
         eta = smoothing * self.eta + (1 - smoothing)
         decay = dr.select(smoothing < 1, smoothing * self.eta / dr.maximum(eta, 1e-30), 1)
-        averaged, error = descend(self.optimizer, errors, self.averaged.parameters(), learning_rate, decay)
+        averaged, error = descend(
+            self.optimizer, errors, self.averaged.parameters(), learning_rate, decay, self.network_share
+        )
         self.averaged.assign(averaged)
         self.averaged.pack()
         learned = dr.isfinite(error)
@@ -434,7 +442,7 @@ class OutgoingCache(IncidentCache):
             records, n_bad = trace_outgoing(scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene))
             n_valid = dr.count(records.valid)
             dr.eval(records, n_bad, n_valid)
-            learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor)
+            learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor, field)
             self.note(field, records, seed, decay)
 
         def watch(y, current, usable):

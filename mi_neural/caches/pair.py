@@ -160,7 +160,9 @@ class PairCache(OutgoingCache):
             pairs = pairs_of(traced, outgoing, self.training.n_paths)
             arrived = fitted(traced.incident, self.training)
             records = fitted(traced.outgoing, self.training)
-            learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor)
+            learning_rate, decay = self.pace(
+                ages, records.surface.position, records.valid, rate_factor, outgoing, incident
+            )
             self.note(outgoing, records, seed, decay)
             prediction = outgoing.query(*records.surface.inputs())
             dr.eval(pairs, arrived, records, prediction)

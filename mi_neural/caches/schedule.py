@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
+
+from .voxels import Ages
 
 
 @dataclass(frozen=True)
@@ -41,3 +44,20 @@ class Ramp:
     def decay(self, step):
         """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
         return dr.minimum(self.ema_decay, 1 - 1 / (step / 3 + 1))
+
+
+def pace(training, ages: Ages, x, valid, rate_factor, *fields) -> tuple:
+    """(learning rate, decay of the average) for records at x, by how long their places have been trained; 1-wide.
+
+    `training` gives ``rate(step)`` and ``decay(step)``. Networks of `fields` learn at a share of that rate: places that
+    are out of view need them as they are, and new ones are learned by the entries of the grid. May be frozen.
+    """
+    age = ages.age(x, valid)
+    learning_rate, decay = mi.Float(training.rate(age) * rate_factor), mi.Float(training.decay(age))
+    share = dr.square(1 - ages.novelty)
+    dr.eval(learning_rate, decay, share)
+    for field in fields:
+        if hasattr(field, "network_share"):
+            field.network_share = share + 0  # not the same variable twice
+            dr.eval(field.network_share)
+    return learning_rate, decay

@@ -91,7 +91,10 @@ class Ages:
     PyTree.
 
     steps    of each cell, those in which a record fell into it
+    first    of each cell, the first of them
     recent   of each cell, mean number of records in the latest steps
+    total    steps so far; 1-wide
+    novelty  share of the latest records that lay in places without a step, had all others had all steps; 1-wide
     usual    what `recent` was at the latest records, their mean; 1-wide
     places   where records lay
 
@@ -102,18 +105,24 @@ class Ages:
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
-        "voxels": object, "steps": object, "recent": object, "usual": object, "places": object,
+        "voxels": object, "steps": object, "first": object, "recent": object, "usual": object, "total": object,
+        "novelty": object, "places": object,
     }  # fmt: skip
-    RESOLUTION, N_ENTRIES = 16, 2**15
+    N_ENTRIES = 2**15
+    #: A cache is no longer new after so many steps; so large a novelty is more than the rare places of any view.
+    OLD, NOVEL = 32, 0.2
+    #: A place into which a record falls in one of so many steps is as old as one that each step finds.
+    SPARSE = 8
     #: Share of `recent` that a step leaves, and how much less than is usual means that a place has left the view.
-    KEPT, RARE = 0.9, 1 / 16
+    KEPT, RARE = 0.5, 1 / 4
 
-    def __init__(self, low, high, steps: int = 0):
-        self.voxels = Voxels(low, high, self.RESOLUTION)
-        self.steps = dr.full(mi.Float, steps, self.N_ENTRIES)
+    def __init__(self, low, high, steps: int = 0, resolution: int = 16):
+        self.voxels = Voxels(low, high, resolution)
+        self.steps, self.first = dr.full(mi.Float, steps, self.N_ENTRIES), dr.zeros(mi.Float, self.N_ENTRIES)
         self.recent, self.usual = dr.zeros(mi.Float, self.N_ENTRIES), mi.Float(0)
+        self.total, self.novelty = mi.Float(steps), mi.Float(0)
         self.places = Places(N_PLACES)
-        dr.make_opaque(self.steps, self.recent, self.usual, self.places)
+        dr.make_opaque(self.steps, self.first, self.recent, self.usual, self.total, self.novelty, self.places)
 
     def age(self, x, valid):
         """``τ (1 / mean(1 / (1 + t/τ)) - 1)`` over the valid records at x, and one step more for their places. 1-wide.
@@ -122,13 +131,22 @@ class Ages:
         count = dr.zeros(mi.Float, self.N_ENTRIES)
         dr.scatter_add(count, 1, i, valid)
         recent = dr.lerp(count, self.recent, self.KEPT)
-        share = dr.rcp(1 + self.steps * (1 / HALF_KNOWN))
-        n = dr.maximum(dr.count(valid), 1)
+        # Since when a place is known; but once seen long ago is not known
+        known = dr.select(self.steps > 0, dr.minimum(self.total - self.first, self.SPARSE * self.steps), 0)
+        share = dr.rcp(1 + known * (1 / HALF_KNOWN))
+        n = dr.maximum(dr.sum(count), 1)
         mean, usual = dr.sum(count * share) / n, dr.sum(count * recent) / n
+        least = dr.rcp(1 + self.total * (1 / HALF_KNOWN))
+        self.novelty = dr.clip((mean - least) / dr.maximum(1 - least, 1e-6), 0, 1)
+        self.first = dr.select((count > 0) & (self.steps == 0), self.total, self.first)
         self.steps = self.steps + dr.select(count > 0, mi.Float(1), 0)
-        self.recent, self.usual = recent, usual
-        dr.eval(self.steps, self.recent, self.usual, mean)
+        self.recent, self.usual, self.total = recent, usual, self.total + 1
+        dr.eval(self.first, self.total, self.novelty, self.steps, self.recent, self.usual, mean)
         return dr.select(mean > 0, HALF_KNOWN * (dr.rcp(dr.maximum(mean, 1e-6)) - 1), 0)
+
+    def novel(self) -> bool:
+        """Whether the camera has come to places that are new to a cache that is not."""
+        return float(self.total[0]) >= self.OLD and float(self.novelty[0]) > self.NOVEL
 
     def left(self, distance) -> tuple:
         """The places that have left the view, for :func:`~mi_neural.caches.training_paths.first_rays`, to be looked at
@@ -140,7 +158,7 @@ class Ages:
         return p, self.places.view, distance
 
     #: What training changes.
-    LEARNED = ("steps", "recent", "usual", "places.position", "places.view", "places.age")
+    LEARNED = ("steps", "first", "recent", "usual", "total", "novelty", "places.position", "places.view", "places.age")
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All that training has changed."""
@@ -154,4 +172,4 @@ class Ages:
         for name in self.LEARNED:
             owner, attribute = (self.places, name.split(".")[1]) if "." in name else (self, name)
             setattr(owner, attribute, type(getattr(owner, attribute))(np.float32(arrays[name])))
-        dr.make_opaque(self.steps, self.recent, self.usual, self.places)
+        dr.make_opaque(self.steps, self.first, self.recent, self.usual, self.total, self.novelty, self.places)
