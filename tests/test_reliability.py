@@ -72,14 +72,13 @@ class Reference:
         self.updates = 0
 
     def cell(self, p):
-        p = np.clip(np.float32(p), self.low, self.high)
-        return np.minimum(((p - self.low) * self.inv_cell).astype(np.uint32), self.c.resolution - 1)
+        return np.floor((np.float32(p) - self.low) * self.inv_cell).astype(np.int32)
 
     @staticmethod
     def hash(cell, side, n):
         h = np.asarray(side, np.uint32) * np.uint32(3674653429)
         for k, factor in enumerate((1, 2654435761, 805459861)):
-            h = h ^ (cell[:, k] * np.uint32(factor))
+            h = h ^ (cell[:, k].astype(np.uint32) * np.uint32(factor))
         return (h % np.uint32(n)).astype(int)
 
     def entry(self, p, normal):

@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import loss
-from .reliability import HASH_FACTORS, frame_sums
+from .voxels import Voxels, cell_sums, check_box, main_axis
 
 #: What is kept per cell.
 ERRORS = ("noise_bounce", "noise_incident", "bias_incident", "bias_outgoing", "bias_product")
@@ -48,8 +48,8 @@ class AccuracyShape:
 
     resolution: int = 16
     region: int = 4
-    n_entries: int = 2**12
-    n_regions: int = 2**8
+    n_entries: int = 2**14
+    n_regions: int = 2**10
 
     def __post_init__(self):
         for name in ("resolution", "region", "n_entries", "n_regions"):
@@ -110,7 +110,7 @@ class Accuracy:
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
-        "box_min": object, "box_max": object, "inv_cell": object, "scale": object, "sums": object,
+        "voxels": object, "scale": object, "sums": object,
         "region_sums": object, "n_pairs": object, "squares": object, "noise_bounce": object, "noise_incident": object,
         "bias_incident": object, "bias_outgoing": object, "bias_product": object, "drift": object,
     }  # fmt: skip
@@ -118,12 +118,10 @@ class Accuracy:
     def __init__(self, box_min, box_max, shape: AccuracyShape | None = None, *, scale: float = 1.0):
         self.shape = shape or AccuracyShape()
         low, high = np.asarray(box_min, np.float64), np.asarray(box_max, np.float64)
-        if not (np.isfinite([low, high]).all() and (high > low).all()):
-            raise ValueError(f"the box {low.tolist()} .. {high.tolist()} is empty or not finite")
+        check_box(low, high)
         if not (np.isfinite(scale) and scale > 0):
             raise ValueError(f"scale is {scale}; it must be a positive number")
-        self.box_min, self.box_max = mi.Point3f(low.tolist()), mi.Point3f(high.tolist())
-        self.inv_cell = mi.Float(float(self.shape.resolution / (high - low).max()))
+        self.voxels = Voxels(low, high, self.shape.resolution)
         self.scale = mi.Float(float(scale))
         self.reset()
 
@@ -139,20 +137,11 @@ class Accuracy:
     # -----------------------------------------------------------------------------------------------------------------
     # Where
 
-    def _cell(self, x):
-        p = dr.clip(dr.select(dr.isfinite(x), mi.Point3f(x), self.box_min), self.box_min, self.box_max)
-        return mi.Vector3u(dr.minimum(mi.Vector3u((p - self.box_min) * self.inv_cell), self.shape.resolution - 1))
-
     def _entry(self, x, normal):
-        a, b, c, d = HASH_FACTORS
-        cell, n = self._cell(x), dr.abs(mi.Vector3f(normal))
-        axis = dr.select((n.x >= n.y) & (n.x >= n.z), mi.UInt32(0), dr.select(n.y >= n.z, mi.UInt32(1), 2))
-        return (cell.x * a ^ cell.y * b ^ cell.z * c ^ axis * d) & (self.shape.n_entries - 1)
+        return self.voxels.entry(x, self.shape.n_entries, main_axis(normal))
 
     def _region(self, x):
-        a, b, c, _ = HASH_FACTORS
-        cell = self._cell(x) // self.shape.region
-        return (cell.x * a ^ cell.y * b ^ cell.z * c) & (self.shape.n_regions - 1)
+        return self.voxels.entry(x, self.shape.n_regions, times=self.shape.region)
 
     # -----------------------------------------------------------------------------------------------------------------
     # What to do
@@ -203,7 +192,7 @@ class Accuracy:
         c = -0.5 * (gain[0] * lack[1] + gain[1] * lack[0])
         one = mi.Float(1)
         entry = self._entry(pairs.position, pairs.normal)
-        new = frame_sums([v, v_i, b_i, b_o, c, one], entry, pairs.valid, self.shape.n_entries)
+        new = cell_sums([v, v_i, b_i, b_o, c, one], entry, pairs.valid, self.shape.n_entries)
         self.sums = [dr.fma(decay, old, s) for old, s in zip(self.sums, new, strict=True)]
         self.n_pairs = dr.fma(decay, self.n_pairs, mi.Float(dr.count(pairs.valid)))
         self.squares = [
@@ -212,7 +201,7 @@ class Accuracy:
         ]
 
         δ = self._relative(targets - predictions, loss.luminance(predictions))
-        new = frame_sums([δ, dr.square(δ), one], self._region(x), valid, self.shape.n_regions)
+        new = cell_sums([δ, dr.square(δ), one], self._region(x), valid, self.shape.n_regions)
         self.region_sums = [dr.fma(decay, old, s) for old, s in zip(self.region_sums, new, strict=True)]
         self._finish()
         dr.eval(self)

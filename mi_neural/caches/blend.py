@@ -47,7 +47,7 @@ class Blend:
         """The grid as it is now, for :meth:`restore`."""
         if self.grid is None:
             return {}
-        return {k: _copies(getattr(self.grid, k)) for k in self.grid.DRJIT_STRUCT}
+        return {k: _copies(getattr(self.grid, k)) for k in self.grid.LEARNED}
 
     def restore(self, state: dict) -> None:
         """Take the grid back to a snapshot, and `fast` to what the field holds."""

@@ -53,7 +53,7 @@ class ControlVariate:
 
     def snapshot(self) -> dict:
         """The statistics as they are now, for :meth:`restore`."""
-        values = {k: getattr(self.grid, k) for k in self.grid.DRJIT_STRUCT}
+        values = {k: getattr(self.grid, k) for k in self.grid.LEARNED}
         return {k: _copies(v) for k, v in {**values, "alpha": self.alpha}.items()}
 
     def restore(self, state: dict) -> None:

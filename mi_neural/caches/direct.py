@@ -20,7 +20,8 @@ import numpy as np
 from ..render.frozen import can_freeze, undisturbed
 from . import encoding, loss
 from .field import Field, FieldShape
-from .schedule import Ramp
+from .schedule import Ramp, pace
+from .voxels import Ages
 
 #: Slope of the output below 0.
 LEAK = 0.01
@@ -66,6 +67,7 @@ class DirectCache:
     def reset(self) -> None:
         """Forget all that was learned."""
         self.field: Field | None = None
+        self.ages: Ages | None = None
         self.steps = 0
         self.statistics = {"direct_steps": 0, "direct_loss": math.nan, "seconds_direct": 0.0}
 
@@ -90,15 +92,16 @@ class DirectCache:
             n_levels=8, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.5, direction_degree=-1,
             width=32, n_hidden=2, leak=0.01,
         )  # fmt: skip
-        self.field = Field(low, high, shape, scale=scale, seed=self.seed)
+        self.field, self.ages = Field(low, high, shape, scale=scale, seed=self.seed), Ages(low, high)
         dr.eval(self.field)
 
-    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, field, ages, seed):
         training = self.training
         with dr.suspend_grad():
             x, y, valid = self.trace(scene, sensor, lights, training.n_points, seed)
             y = dr.select(valid, dr.clip(y / field.scale, 0, TARGET_MAX), 0)
             dr.eval(x, y, valid)
+            learning_rate, decay = pace(training, ages, x, valid, 1.0, field)
             n_valid = dr.maximum(dr.count(valid), 1)
             field.mean = dr.lerp(dr.sum(loss.luminance(y)) / n_valid, field.mean, decay)
             dr.eval(field.mean)
@@ -118,9 +121,8 @@ class DirectCache:
         frame = self._frame if self._sensor_freezes[id(sensor)] else self._frame_plain
         for _ in range(steps):
             with undisturbed():
-                value = frame(scene, sensor, lights, self.field, dr.opaque(mi.UInt32, self._seed(self.steps)),
-                              dr.opaque(mi.Float, self.training.rate(self.steps)),
-                              dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
+                value = frame(scene, sensor, lights, self.field, self.ages,
+                              dr.opaque(mi.UInt32, self._seed(self.steps)))  # fmt: skip
             self.steps += 1
             self.field.steps = self.steps
         if steps:

@@ -13,6 +13,11 @@ import numpy as np
 MARGIN = 0.15
 
 
+def in_box(p, box_min, box_inv_extent):
+    """Scene position over the box: [0, 1]^3 inside."""
+    return mi.Point3f((p - box_min) * box_inv_extent)
+
+
 def to_unit_cube(p, box_min, box_inv_extent):
     """Scene position to [0, 1]^3; what lies outside is moved to the surface of the cube."""
     return mi.Point3f(dr.clip((p - box_min) * box_inv_extent, 0, 1))

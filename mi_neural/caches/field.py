@@ -13,6 +13,7 @@ from drjit.opt import Adam
 
 from . import backprop, encoding, files
 from .files import FILE_VERSION, CacheFileError
+from .hash_grid import HashGrid
 
 __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedField", "Weights"]
 
@@ -76,8 +77,8 @@ class FieldShape:
 
     @property
     def n_encoded(self) -> int:
-        """Values that :meth:`Field.encode` gives for a position."""
-        return self.width
+        """Values that :meth:`Field.encode` gives for a position: the first layer's, and the shortcut's three."""
+        return self.width + 3
 
 
 def own_copy(value):
@@ -100,18 +101,21 @@ def attach_adam(parameters: dict) -> Adam:
     return optimizer
 
 
-def descend(optimizer: Adam, losses, averaged: dict, learning_rate, decay) -> tuple[dict, mi.Float]:
+def descend(
+    optimizer: Adam, losses, averaged: dict, learning_rate, decay, network_share=1.0
+) -> tuple[dict, mi.Float]:  # fmt: skip
     """One step of Adam down the gradient of the sum of `losses`, a differentiable array. Returns (the new averaged
     parameters, the sum).
 
-    ``averaged <- decay averaged + (1 - decay) current``. A sum that is not finite changes nothing. May be frozen.
+    All but the hash grid learns at `network_share` of the rate. ``averaged <- decay averaged + (1 - decay) current``. A
+    sum that is not finite changes nothing. May be frozen.
     """
     dr.schedule(dr.detach(losses))  # summed beforehand, they would take a kernel of their own that goes forth
     dr.backward(losses)
     loss = dr.sum(dr.detach(losses))
     ok = dr.isfinite(loss)
     # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
-    optimizer.set_learning_rate({k: mi.Float(learning_rate) for k in optimizer})
+    optimizer.set_learning_rate({k: mi.Float(learning_rate) * (1 if k == "grid" else network_share) for k in optimizer})
     optimizer.step(eval=False, active=ok)
     optimizer.set_learning_rate({k: None for k in optimizer})
     decay = dr.select(ok, decay, 1)
@@ -165,7 +169,7 @@ class Weights:
 
     def __init__(self, shape: FieldShape, seed: int, half: bool | None = None):
         # The grid starts near 0; anything from 1e-4 to 1e-1 trained alike
-        self.grid = nn.HashGridEncoding(
+        self.grid = HashGrid(
             mi.Float, 3, n_levels=shape.n_levels, n_features_per_level=shape.n_features,
             hashmap_size=shape.hashmap_size, base_resolution=shape.base_resolution,
             per_level_scale=shape.per_level_scale, init_scale=1e-2, rng=dr.rng(seed=2 * seed),
@@ -250,6 +254,16 @@ class Weights:
 
     def _vector(self, values: list) -> nn.CoopVec:
         return nn.CoopVec(*[mi.Float16(v) for v in values] if self.half else values)
+
+
+def shortcut(values: list, gain: float) -> mi.Color3f:
+    """What the first three of a grid's `values`, those of its coarsest levels, add to the outputs past the network.
+
+    Places have the colours of their light in entries of their own then, which are learned in a few steps. Without it, a
+    room entered is learned by moving the network's biases, and the room left is forgotten: in a walk of 30 frames a
+    room relMSE 0.2 to 0.4 in the new one, above 1 in the old ones, where with it 0.02 is reached in both.
+    """
+    return mi.Color3f(*(values[k % len(values)] for k in range(3))) * gain
 
 
 class TrainedField:
@@ -395,7 +409,7 @@ class TrainedField:
 
         Raises `CacheFileError` for a file that is missing, cut short, not of such a field, or of another version.
         """
-        header, arrays = files.read(path, cls.KIND, cls.UNKNOWN)
+        header, arrays = files.read(path, cls.KIND, (*cls.UNKNOWN, "extra.ages.places.position"))
         extra = {k.removeprefix("extra."): arrays.pop(k) for k in list(arrays) if k.startswith("extra.")}
         try:
             field = cls.make(header)
@@ -428,9 +442,12 @@ class Field(TrainedField):
     """
 
     KIND, WEIGHTS = "incident", Weights
+    #: Of :func:`shortcut`. In a room lit through a door ajar, 400 steps: relMSE 0.088, 0.092, 0.097 with 0, 8, 16; two
+    #: rooms in a row, 30 steps in the second: 0.19, -, 0.005.
+    GAIN = 8.0
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
-        "scale": object, "mean": object,
+        "scale": object, "mean": object, "network_share": object,
     }  # fmt: skip
 
     def __init__(self, box_min, box_max, shape: FieldShape | None = None, *, scale: float = 1.0, seed: int = 0):
@@ -452,9 +469,10 @@ class Field(TrainedField):
         self.current = self.WEIGHTS(self.shape, self.seed)
         self.averaged = self.WEIGHTS(self.shape, self.seed)
         self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
+        self.network_share = mi.Float(1)
         self._attach_optimizer()
         self.steps = 0
-        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean)
+        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean, self.network_share)
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -474,14 +492,17 @@ class Field(TrainedField):
 
     def features(self, weights: Weights, x) -> list:
         """:meth:`encode` by any weights of this field's shape."""
-        return weights.start(self._grid_values(weights, x))
+        values = self._grid_values(weights, x)
+        return [*weights.start(values), *shortcut(values, self.GAIN)]
 
     def _grid_values(self, weights: Weights, x) -> list:
-        return list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        return list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
     def output(self, weights: Weights, features: list, w):
         """:meth:`raw` by any weights of this field's shape."""
-        return mi.Color3f(*weights.finish(features, encoding.direction(w, self.shape.direction_degree))) + 1
+        *started, r, g, b = features
+        values = weights.finish(started, encoding.direction(w, self.shape.direction_degree))
+        return mi.Color3f(*values) + mi.Color3f(r, g, b) + 1
 
     def answer(self, weights: Weights, features: list, w):
         """:meth:`query` by any weights of this field's shape."""
@@ -498,8 +519,9 @@ class Field(TrainedField):
         Call it once per :meth:`step`, before it.
         """
         weights = self.trainable()
-        inputs = [*self._grid_values(weights, self.lift(x, n)), *encoding.direction(w, self.shape.direction_degree)]
-        return mi.Color3f(*weights.differentiable(inputs)) + 1
+        values = self._grid_values(weights, self.lift(x, n))
+        inputs = [*values, *encoding.direction(w, self.shape.direction_degree)]
+        return mi.Color3f(*weights.differentiable(inputs)) + shortcut(values, self.GAIN) + 1
 
     def step(self, losses, learning_rate, decay):
         """One step of Adam down the gradient of the sum of `losses`, a differentiable array; then the averaged copy.
@@ -508,7 +530,9 @@ class Field(TrainedField):
         ``averaged <- decay averaged + (1 - decay) current``: with a `decay` that grows from 0, as the integrators give
         it, the average is free of bias from its start. A sum that is not finite changes nothing. May be frozen.
         """
-        average, loss = descend(self.optimizer, losses, self.averaged.parameters(), learning_rate, decay)
+        average, loss = descend(
+            self.optimizer, losses, self.averaged.parameters(), learning_rate, decay, self.network_share
+        )
         self.averaged.assign(average)
         self.averaged.pack()
         return loss

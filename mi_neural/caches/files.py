@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 #: Changes when a file written before cannot be read any more.
-FILE_VERSION = 3
+FILE_VERSION = 4
 #: What is said of a file that is not of the kind asked for.
 KINDS = {
     "incident": "holds no incident radiance alone; train an incident cache and save it",

@@ -25,14 +25,19 @@ from . import encoding, loss
 from .blend import Blend
 from .divergence import StepWatch, healthy
 from .field import Field, FieldShape
+from .places import N_PLACES
 from .records import TrainingRecords
 from .reliability import Reliability
+from .schedule import pace
 from .training_paths import Suffixes, trace_training_paths
+from .voxels import Ages
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
 TARGET_MAX = 1e4
 #: Targets are cut to this share of outliers when the scene's mean is measured.
 SCALE_TRIM = 1e-3
+#: Share of the training paths that start where records lay, if that place has left the view.
+WORLD_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -70,16 +75,20 @@ class Training:
         if not 0 < self.last_rate <= 1:
             raise ValueError(f"last_rate is {self.last_rate}; it must be greater than 0 and at most 1")
 
-    def rate(self, step: int) -> float:
-        """Learning rate of a step: a hundred steps at full speed, then falling as 1/t to `last_rate` of it."""
-        return self.learning_rate * max(self.last_rate, 1 / (1 + step / 100))
+    def rate(self, step):
+        """Learning rate after so many steps, a number or a Dr.Jit array: a hundred steps at full speed, then falling as
+        1/t to `last_rate` of it."""
+        return self.learning_rate * dr.maximum(self.last_rate, 1 / (1 + step / 100))
 
-    def decay(self, step: int) -> float:
-        """EMA decay of a step: the average spans the last seventh of the steps so far, at most the full horizon."""
-        return min(self.ema_decay, 1 - 1 / (0.15 * step + 1))
+    def decay(self, step):
+        """EMA decay after so many steps: the average spans the last seventh of them, at most the full
+        horizon."""
+        return dr.minimum(self.ema_decay, 1 - 1 / (0.15 * step + 1))
 
 
-def trace_records(scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None):
+def trace_records(
+    scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None, places: tuple | None = None
+):
     """Fresh training records, and how many were left out because they were not finite.
 
     Targets end in the cache as it is queried (in nothing without one); `lights` as in ``render.path.bounce``."""
@@ -89,9 +98,9 @@ def trace_records(scene, sensor, field: Field | Blend | None, training: Training
     def from_cache(si, bsdf, active, sampler):
         return reflect(field, field.encode(si.p, vertex.facing(si)), si, bsdf, training.n_tail, sampler, active)
 
-    plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False)
+    plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False, world_share=WORLD_SHARE)
     query = from_cache if field is not None else None
-    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights)
+    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights, places)
     return traced.incident, traced.n_bad[1]
 
 
@@ -176,6 +185,8 @@ class IncidentCache:
     BRIGHTER = 100.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
+    #: Steps of a frame while the camera is in new places: 30 frames then do as much as for a cache that is new itself.
+    STEPS_IN_NEW_PLACES = 3
     #: What is trained, its sizes, and what blends its two sets of weights.
     FIELD, SHAPE, BLEND = Field, FieldShape, Blend
     #: Whether functions of the scene can be frozen.
@@ -203,6 +214,7 @@ class IncidentCache:
     def reset(self) -> None:
         """Forget all that was learned. Compiled kernels are kept."""
         self.field: Field | None = None
+        self.ages: Ages | None = None
         self._blend: Blend | None = None
         self.steps = 0
         self.rate_factor = 1.0
@@ -240,13 +252,22 @@ class IncidentCache:
     def _probe_plain(self, scene, sensor, lights, seed):
         return trace_records(scene, sensor, None, self.training, seed, lights)
 
-    def _frame_plain(self, scene, sensor, lights, cache, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, cache, ages, seed, rate_factor):
         with dr.suspend_grad():
-            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights)
+            plain = getattr(cache, "field", cache)
+            places = ages.left(1e-3 * dr.norm(1 / plain.box_inv_extent))
+            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights, places)
             dr.eval(records, n_bad)
+            sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x7F4A7C15)
+            ages.places.remember(records.position, records.normal, records.valid, sampler)
+            learning_rate, decay = self.pace(ages, records.position, records.valid, rate_factor, plain)
         outputs = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
         sigma = cache.mean_sigma() if hasattr(cache, "mean_sigma") else mi.Float(0)
         return *outputs, dr.count(records.valid), n_bad, sigma
+
+    def pace(self, ages: Ages, x, valid, rate_factor, *fields) -> tuple:
+        """:func:`~mi_neural.caches.schedule.pace` of this training."""
+        return pace(self.training, ages, x, valid, rate_factor, *fields)
 
     def make_field(self, low: list, high: list, scale: float):
         """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""
@@ -271,24 +292,30 @@ class IncidentCache:
             scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-30):
             scale = 1e-20  # no indirect light found: the cache answers with nothing
-        self.field = self.make_field(low, high, scale)
+        self.field, self.ages = self.make_field(low, high, scale), Ages(low, high)
         dr.eval(self.field)
 
     def train_frame(self, scene, sensor, lights=None) -> float:
-        """Trace fresh records and take one step on them; returns the loss. Divergence is undone, see `recover`."""
+        """Trace fresh records and take one step on them, or `STEPS_IN_NEW_PLACES` where the camera has come to places
+        that were not trained before; returns the loss. Divergence is undone, see `recover`."""
+        value = self._train_step(scene, sensor, lights)
+        if self.ages is not None and self.ages.novel():
+            for _ in range(self.STEPS_IN_NEW_PLACES - 1):
+                value = self._train_step(scene, sensor, lights)
+        return value
+
+    def _train_step(self, scene, sensor, lights) -> float:
         t0 = time.perf_counter()
         if self.field is None:
             self.start(scene, sensor, lights)
         if self._good is None:
             self._good = self.field.snapshot()
         self._step_watch.begin(*self.field.optimizers())
-        training = self.training
-        rate = training.rate(self.steps) * self.rate_factor
         frame = self._frame if self.freezes(sensor) else self._frame_plain
         with dr.resume_grad(), undisturbed():
             outputs = frame(
-                scene, sensor, lights, self.asked, mi.UInt32(self._seed(self.steps)),
-                dr.opaque(mi.Float, rate), dr.opaque(mi.Float, training.decay(self.steps)),
+                scene, sensor, lights, self.asked, self.ages, mi.UInt32(self._seed(self.steps)),
+                dr.opaque(mi.Float, self.rate_factor),
             )  # fmt: skip
         value, mean_target, mean_prediction, n_valid, n_bad, sigma = (v[0] for v in outputs)
         self.steps += 1
@@ -349,6 +376,7 @@ class IncidentCache:
     def adopt(self, field: Field) -> None:
         """Go on from a field that was trained before."""
         self.field, self.steps, self._good = field, field.steps, None
+        self.ages = Ages(*field.box, steps=field.steps)
 
     def _schedule(self) -> dict:
         """Numbers that steer training, apart from the field's."""
@@ -359,6 +387,7 @@ class IncidentCache:
         asked, extra, constants = self.asked, {}, None
         if isinstance(asked, Blend) and asked.grid is not None:
             extra, constants = asked.grid.arrays(), asdict(asked.grid.constants)
+        extra = extra | {f"ages.{k}": v for k, v in self.ages.arrays().items()}
         self.field.save(path, extra, training=self._schedule(), reliability=constants, **facts)
 
     def read(self, path) -> tuple:
@@ -380,6 +409,8 @@ class IncidentCache:
             self.history, self.levels = ([float(v) for v in found[name]] for name in ("history", "levels"))
             if not 0 < self.rate_factor <= 1:
                 raise ValueError(f"it says that the learning rate was cut to {self.rate_factor}")
+            self.ages.set_arrays({k.removeprefix("ages."): v for k, v in extra.items()})
+            extra = {k: v for k, v in extra.items() if not k.startswith("ages.")}
             grid = getattr(self.asked, "grid", None)
             if grid is not None and header.get("reliability") == asdict(grid.constants):
                 grid.set_arrays(extra)
@@ -392,7 +423,7 @@ class IncidentCache:
     def checkpoint(self):
         """Everything that training changes, to go back to with :meth:`rollback`."""
         return (
-            None if self.field is None else (self.field, self.field.checkpoint()),
+            None if self.field is None else (self.field, self.field.checkpoint(), self.ages.arrays()),
             None if self._blend is None else self._blend.snapshot(),
             self.steps, self._schedule(), self._good, dict(self.statistics),
         )  # fmt: skip
@@ -403,13 +434,14 @@ class IncidentCache:
             field = self.field
             self.reset()
             field.reset()
-            self.field = field
+            self.field, self.ages = field, Ages(*field.box)
             return
         held, blend, self.steps, schedule, self._good, self.statistics = state
         self.rate_factor, self.history, self.levels = (schedule[k] for k in ("rate_factor", "history", "levels"))
         if held is not None:
-            self.field, kept = held  # training may have begun a new one
+            self.field, kept, ages = held  # training may have begun a new one
             self.field.rollback(kept)
+            self.ages.set_arrays(ages)
             if self._blend is not None and blend is not None:
                 self._blend.restore(blend)
 

@@ -22,11 +22,13 @@ from ..render.sampling import PathSampler
 from ..render.surface import scene_is_glossy, surface_of
 from . import encoding, loss
 from .blend import OutgoingBlend
-from .field import FieldShape, TrainedField, Weights, descend
+from .field import FieldShape, TrainedField, Weights, descend, shortcut
 from .incident import SCALE_TRIM, IncidentCache, Training
+from .places import N_PLACES, Places
 from .records import packed
 from .reliability import Reliability
 from .training_paths import CONTENTS, Suffixes, trace_training_paths
+from .voxels import Ages, Voxels, check_box
 
 #: Reflectances below this count as this, so that no target is divided by 0 and black surfaces have an answer.
 ALBEDO_MIN = 0.05
@@ -40,10 +42,8 @@ RATE = 3.0
 ROUGHNESS_BINS = 4
 #: What the network can be told of a surface beside its position.
 INPUTS = ("normal", "view", "albedo", "roughness")
-#: Cells along each axis of the box in which training records are counted.
-DENSITY_CELLS = 32
-#: Places that are remembered, and steps after which all earlier ones weigh as much as the next 1000.
-N_PLACES, PLACES_HORIZON = 4096, 1000
+#: Cells along the longest axis of the box in which training records are counted, and entries of their table.
+DENSITY_CELLS, DENSITY_ENTRIES = 32, 2**15
 
 
 @dataclass(frozen=True)
@@ -95,41 +95,6 @@ def reflectance(albedo):
     return dr.maximum(albedo, ALBEDO_MIN)
 
 
-def check_box(box_min: np.ndarray, box_max: np.ndarray) -> None:
-    finite = box_min.shape == box_max.shape == (3,) and np.isfinite([box_min, box_max]).all()
-    if not (finite and (box_max > box_min).all()):
-        raise ValueError(f"the box {box_min.tolist()} .. {box_max.tolist()} is empty or not finite")
-
-
-class Places:
-    """Where records lay, and from where they were seen: an even sample of all steps so far, so that training can come
-    back to what has left the view. A PyTree.
-
-    position   world space; not finite: unknown
-    view       towards the viewer
-    age        steps so far, 1-wide
-    """
-
-    DRJIT_STRUCT = {"position": object, "view": object, "age": object}  # noqa: RUF012
-
-    def __init__(self, n: int):
-        self.position = dr.full(mi.Point3f, math.nan, n)
-        self.view = dr.zeros(mi.Vector3f, n)
-        self.age = mi.Float(0)
-
-    def remember(self, position, view, valid, sampler) -> None:
-        """Put random records of this step into so many random places as make all steps equally likely (reservoir
-        sampling); after a horizon, recent ones more so."""
-        self.age = self.age + 1
-        n = dr.width(valid)
-        i = dr.minimum(mi.UInt32(sampler.next_1d() * n), n - 1)
-        new = dr.gather(mi.Bool, valid, i)
-        new &= (sampler.next_1d() * dr.minimum(self.age, PLACES_HORIZON) < 1) | ~dr.isfinite(self.position.x)
-        self.position = dr.select(new, dr.gather(mi.Point3f, position, i, new), self.position)
-        self.view = dr.select(new, dr.gather(mi.Vector3f, view, i, new), self.view)
-        dr.eval(self.position, self.view, self.age)
-
-
 class OutgoingField(TrainedField):
     """Outgoing radiance as a function of position, normal, view direction, albedo and roughness, learned online.
 
@@ -148,11 +113,14 @@ class OutgoingField(TrainedField):
     """
 
     KIND = "outgoing"
+    #: Of :func:`~mi_neural.caches.field.shortcut`; as there, over `RATE`.
+    GAIN = 3.0
     BESIDE = ("density", "places.position", "places.view", "places.age")
     UNKNOWN = ("beside.places.position",)
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "scale": object,
-        "eta": object, "density": object, "places": object,
+        "eta": object, "density": object, "places": object, "voxels": object,
+        "network_share": object,
     }  # fmt: skip
 
     def __init__(
@@ -166,6 +134,7 @@ class OutgoingField(TrainedField):
         self.box = (box_min.tolist(), box_max.tolist())
         self.box_min = mi.Point3f(box_min.tolist())
         self.box_inv_extent = mi.Vector3f((1 / (box_max - box_min)).tolist())
+        self.voxels = Voxels(box_min, box_max, DENSITY_CELLS)
         self.given_scale = None if scale is None else float(scale)
         self.reset()
 
@@ -175,11 +144,13 @@ class OutgoingField(TrainedField):
         self.averaged = Weights(self.shape, self.seed)
         self._attach_optimizer()
         self.scale = mi.Float(self.given_scale or 0.0)
+        self.network_share = mi.Float(1)
         self.eta = mi.Float(0.0)  # 1 - a^t: the share of the average that training has filled
-        self.density = dr.zeros(mi.Float, DENSITY_CELLS**3)  # mean training records of a step in each cell of the box
+        self.density = dr.zeros(mi.Float, DENSITY_ENTRIES)  # mean training records of a step in each cell
         self.places = Places(N_PLACES)
         self.steps = 0
-        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places)
+        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places,
+                       self.network_share)  # fmt: skip
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -196,16 +167,20 @@ class OutgoingField(TrainedField):
             "albedo": lambda: dr.clip(albedo, 0, 1),
             "roughness": lambda: encoding.one_blob(1 - dr.exp(-dr.maximum(roughness, 0)), ROUGHNESS_BINS),
         }
-        values = list(weights.grid(encoding.to_unit_cube(self.lift(x, n), self.box_min, self.box_inv_extent)))
+        values = list(weights.grid(encoding.in_box(self.lift(x, n), self.box_min, self.box_inv_extent)))
         for name in INPUTS:
             if name in self.shape.inputs:
                 values += list(encoded[name]())
         return values
 
+    def _past(self, values: list):
+        return shortcut(values[: self.shape.n_features_total], self.GAIN)
+
     def raw(self, x, n, w, albedo, roughness, averaged: bool = True):
         """The network's output: radiance over albedo and `scale`, not clamped; all inputs must be `usable`."""
         weights = self.averaged if averaged else self.current
-        return mi.Color3f(*weights(self._encode(weights, x, n, w, albedo, roughness))) + 1
+        values = self._encode(weights, x, n, w, albedo, roughness)
+        return mi.Color3f(*weights(values)) + self._past(values) + 1
 
     def query(self, x, n, w, albedo, roughness, averaged: bool = True):
         """Radiance that leaves the surface towards `w`; never negative, and 0 where an input is not `usable`."""
@@ -215,7 +190,8 @@ class OutgoingField(TrainedField):
         """:meth:`query` by any weights of this field's shape."""
         usable = self.usable(x, n, w, albedo, roughness)
         inputs = _sanitize(usable, x, n, w, albedo, roughness)
-        value = dr.maximum(mi.Color3f(*weights(self._encode(weights, *inputs))) + 1, 0)
+        values = self._encode(weights, *inputs)
+        value = dr.maximum(mi.Color3f(*weights(values)) + self._past(values) + 1, 0)
         value = value * self.scale * reflectance(inputs[3])
         return dr.select(usable & dr.all(dr.isfinite(value)), value, 0)
 
@@ -225,7 +201,8 @@ class OutgoingField(TrainedField):
     def predict(self, x, n, w, albedo, roughness):
         """What :meth:`raw` gives for the weights being trained, differentiable with respect to them."""
         weights = self.trainable()
-        return mi.Color3f(*weights.differentiable(self._encode(weights, x, n, w, albedo, roughness))) + 1
+        values = self._encode(weights, x, n, w, albedo, roughness)
+        return mi.Color3f(*weights.differentiable(values)) + self._past(values) + 1
 
     def learn(
         self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,
@@ -271,7 +248,9 @@ class OutgoingField(TrainedField):
         errors = dr.select(able, errors, math.nan)
         eta = smoothing * self.eta + (1 - smoothing)
         decay = dr.select(smoothing < 1, smoothing * self.eta / dr.maximum(eta, 1e-30), 1)
-        averaged, error = descend(self.optimizer, errors, self.averaged.parameters(), learning_rate, decay)
+        averaged, error = descend(
+            self.optimizer, errors, self.averaged.parameters(), learning_rate, decay, self.network_share
+        )
         self.averaged.assign(averaged)
         self.averaged.pack()
         learned = dr.isfinite(error)
@@ -286,13 +265,11 @@ class OutgoingField(TrainedField):
     # Where records lie
 
     def _cell(self, x):
-        unit = encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)
-        i = mi.Point3u(dr.minimum(unit * DENSITY_CELLS, DENSITY_CELLS - 1))
-        return (i.z * DENSITY_CELLS + i.y) * DENSITY_CELLS + i.x
+        return self.voxels.entry(x, DENSITY_ENTRIES)
 
     def count(self, x, valid, decay) -> None:
         """Take this step's records into `density`: ``density <- decay density + (1 - decay) count``."""
-        counted = dr.zeros(mi.Float, DENSITY_CELLS**3)
+        counted = dr.zeros(mi.Float, DENSITY_ENTRIES)
         dr.scatter_add(counted, 1, self._cell(x), valid)
         self.density = dr.lerp(counted, self.density, decay)
         dr.eval(self.density)
@@ -458,13 +435,14 @@ class OutgoingCache(IncidentCache):
         target = records.target / reflectance(records.surface.albedo)
         return records.surface.position, loss.luminance(target), records.valid
 
-    def _frame_plain(self, scene, sensor, lights, asked, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, asked, ages, seed, rate_factor):
         blend = asked if isinstance(asked, OutgoingBlend) else None
         field = blend.field if blend else asked
         with dr.suspend_grad():
             records, n_bad = trace_outgoing(scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene))
             n_valid = dr.count(records.valid)
             dr.eval(records, n_bad, n_valid)
+            learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor, field)
             self.note(field, records, seed, decay)
 
         def watch(y, current, usable):
@@ -507,5 +485,5 @@ class OutgoingCache(IncidentCache):
             scale = float(target[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
         if not (math.isfinite(scale) and scale > 1e-20):
             scale = 1e-20  # no light found: the cache answers with nothing
-        self.field = OutgoingField(low, high, self.shape, scale=scale, seed=self.seed)
+        self.field, self.ages = OutgoingField(low, high, self.shape, scale=scale, seed=self.seed), Ages(low, high)
         dr.eval(self.field)

@@ -48,6 +48,10 @@ class PairField(TrainedField):
         return self.outgoing.scale
 
     @property
+    def box(self) -> tuple:
+        return self.outgoing.box
+
+    @property
     def box_min(self):
         return self.outgoing.box_min
 
@@ -140,7 +144,7 @@ class PairCache(OutgoingCache):
         self.field = PairField(outgoing, incident, Accuracy(*outgoing.box, scale=scale))
         dr.eval(self.field)
 
-    def _frame_plain(self, scene, sensor, lights, field, seed, learning_rate, decay):
+    def _frame_plain(self, scene, sensor, lights, field, ages, seed, rate_factor):
         outgoing, incident = field.outgoing, field.incident
 
         def ask(si, bsdf, active, sampler):
@@ -156,6 +160,9 @@ class PairCache(OutgoingCache):
             pairs = pairs_of(traced, outgoing, self.training.n_paths)
             arrived = fitted(traced.incident, self.training)
             records = fitted(traced.outgoing, self.training)
+            learning_rate, decay = self.pace(
+                ages, records.surface.position, records.valid, rate_factor, outgoing, incident
+            )
             self.note(outgoing, records, seed, decay)
             prediction = outgoing.query(*records.surface.inputs())
             dr.eval(pairs, arrived, records, prediction)

@@ -13,7 +13,8 @@ import numpy as np
 
 from ..render.frozen import undisturbed
 from .field import CacheFileError, own_copy
-from .outgoing import OutgoingField, OutgoingShape, check_box
+from .outgoing import OutgoingField, OutgoingShape
+from .voxels import check_box
 
 #: Defaults of the guide.
 LEARNING_RATE, WEIGHT_SMOOTHING = 0.002, 0.99

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
+
+from .voxels import Ages
+
 
 @dataclass(frozen=True)
 class Ramp:
@@ -32,10 +37,27 @@ class Ramp:
                 "greater than 0"
             )
 
-    def rate(self, step: int) -> float:
-        """Learning rate of a step."""
-        return self.first_rate + (self.last_rate - self.first_rate) * min(step / max(self.ramp, 1), 1.0)
+    def rate(self, step):
+        """Learning rate after so many steps, a number or a Dr.Jit array."""
+        return self.first_rate + (self.last_rate - self.first_rate) * dr.minimum(step / max(self.ramp, 1), 1.0)
 
-    def decay(self, step: int) -> float:
+    def decay(self, step):
         """Decay of a step: the average spans the last third of the steps so far, at most the full horizon."""
-        return min(self.ema_decay, 1 - 1 / (step / 3 + 1))
+        return dr.minimum(self.ema_decay, 1 - 1 / (step / 3 + 1))
+
+
+def pace(training, ages: Ages, x, valid, rate_factor, *fields) -> tuple:
+    """(learning rate, decay of the average) for records at x, by how long their places have been trained; 1-wide.
+
+    `training` gives ``rate(step)`` and ``decay(step)``. Networks of `fields` learn at a share of that rate: places that
+    are out of view need them as they are, and new ones are learned by the entries of the grid. May be frozen.
+    """
+    age = ages.age(x, valid)
+    learning_rate, decay = mi.Float(training.rate(age) * rate_factor), mi.Float(training.decay(age))
+    share = dr.square(1 - ages.novelty)
+    dr.eval(learning_rate, decay, share)
+    for field in fields:
+        if hasattr(field, "network_share"):
+            field.network_share = share + 0  # not the same variable twice
+            dr.eval(field.network_share)
+    return learning_rate, decay

@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import drjit as dr
-import drjit.nn as nn
 import mitsuba as mi
 
 from . import encoding
 from .field import Field
+from .hash_grid import HashGrid
 from .incident import IncidentCache
 
 
@@ -66,7 +66,7 @@ class HarmonicWeights:
 
     def __init__(self, shape: HarmonicShape, seed: int):
         size = max(shape.hashmap_size // shape.n_stored, 1) * shape.n_stored
-        self.grid = nn.HashGridEncoding(
+        self.grid = HashGrid(
             mi.Float, 3, n_levels=shape.n_levels, n_features_per_level=shape.n_stored, hashmap_size=size,
             base_resolution=shape.base_resolution, per_level_scale=shape.per_level_scale, init_scale=1e-3,
             rng=dr.rng(seed=2 * seed),
@@ -95,7 +95,7 @@ class HarmonicField(Field):
         super().__init__(box_min, box_max, shape or HarmonicShape(), scale=scale, seed=seed)
 
     def features(self, weights: HarmonicWeights, x) -> list:
-        values = list(weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        values = list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
         levels = [values[k :: self.shape.n_stored] for k in range(self.shape.n_encoded)]
         return [sum(level[1:], level[0]) for level in levels]
 

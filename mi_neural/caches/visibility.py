@@ -19,7 +19,8 @@ from ..render.sampling import PathSampler
 from . import encoding
 from .divergence import StepWatch, healthy
 from .field import FieldShape, Weights, attach_adam, descend, own_copy
-from .schedule import Ramp
+from .schedule import Ramp, pace
+from .voxels import Ages
 
 #: Steps whose points are found in one go, where there are so many to do.
 BATCH = 8
@@ -43,7 +44,9 @@ class VisibilityField:
     ``query(x)`` gives a list of Dr.Jit floats. An untrained field says about 1/2 for all.
     """
 
-    DRJIT_STRUCT = {"weights": object, "optimizer": object, "box_min": object, "box_inv_extent": object}  # noqa: RUF012
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "weights": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "network_share": object,
+    }  # fmt: skip
 
     def __init__(self, box_min, box_max, shape: FieldShape, seed: int = 0):
         self.shape, self.seed = shape, seed
@@ -55,11 +58,12 @@ class VisibilityField:
 
     def reset(self) -> None:
         """The weights as they were when the field was made."""
+        self.network_share = mi.Float(1)
         self.weights = Weights(self.shape, self.seed)
         self.optimizer = attach_adam(self.weights.parameters())
         self.weights.assign({k: own_copy(v) for k, v in self.weights.parameters().items()})
         self.weights.pack()
-        dr.make_opaque(self.box_min, self.box_inv_extent)
+        dr.make_opaque(self.box_min, self.box_inv_extent, self.network_share)
         dr.eval(self.optimizer, self.weights)
 
     def snapshot(self) -> tuple[dict, dict]:
@@ -81,7 +85,7 @@ class VisibilityField:
         return [_sigmoid(v) for v in self.weights(self._encode(x))]
 
     def _encode(self, x) -> list:
-        return list(self.weights.grid(encoding.to_unit_cube(x, self.box_min, self.box_inv_extent)))
+        return list(self.weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
     def step(self, x, visible, learning_rate, decay):
         """One step of Adam on ``mean (V(x) - visible)²``; `visible` is a tensor (n_outputs, points). Returns the loss.
@@ -94,7 +98,7 @@ class VisibilityField:
         lane = dr.arange(mi.UInt32, n)
         errors = [dr.square(_sigmoid(v) - dr.gather(mi.Float, visible.array, lane + k * n)) for k, v in enumerate(out)]
         losses = sum(errors[1:], errors[0]) * (1 / (n * len(out)))
-        averaged, loss = descend(self.optimizer, losses, averaged, learning_rate, decay)
+        averaged, loss = descend(self.optimizer, losses, averaged, learning_rate, decay, self.network_share)
         self.weights.assign(averaged)
         self.weights.pack()
         dr.eval(self.weights)
@@ -184,6 +188,7 @@ class VisibilityCache:
     def reset(self) -> None:
         """Forget all that was learned."""
         self.field: VisibilityField | None = None
+        self.ages: Ages | None = None
         self.steps = 0
         self.rate_factor = 1.0
         self._good: tuple[dict, dict] | None = None
@@ -210,7 +215,7 @@ class VisibilityCache:
             n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
             width=32, n_hidden=2, n_outputs=n_outputs, leak=0.01,
         )  # fmt: skip
-        self.field = VisibilityField(low, high, shape, self.seed)
+        self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high)
 
     def _records(self, scene, sensor, table, groups, seeds):
         """Training points of some steps, one for each of `seeds`, and what they see: (points, step by step; 1 or 0 by
@@ -235,7 +240,9 @@ class VisibilityCache:
             dr.eval(visible)
         return x, visible
 
-    def _step_plain(self, field, x, visible, learning_rate, decay):
+    def _step_plain(self, field, ages, x, visible, rate_factor):
+        with dr.suspend_grad():
+            learning_rate, decay = pace(self.training, ages, x, mi.Bool(True), rate_factor, field)
         visible = mi.TensorXf(visible, shape=(field.shape.n_outputs, dr.width(x)))
         return field.step(x, visible, learning_rate, decay)
 
@@ -257,9 +264,9 @@ class VisibilityCache:
                 points = self._records(scene, sensor, table, groups, seeds)
                 for k in range(n_steps):
                     self._step_watch.begin(self.field.optimizer)
-                    loss = self._step(self.field, *_part(points, k, n_steps),
-                                      dr.opaque(mi.Float, self.training.rate(self.steps) * self.rate_factor),
-                                      dr.opaque(mi.Float, self.training.decay(self.steps)))  # fmt: skip
+                    loss = self._step(
+                        self.field, self.ages, *_part(points, k, n_steps), dr.opaque(mi.Float, self.rate_factor)
+                    )
                     self.steps += 1
                     self._watch(loss[0])
             done += n_steps
