@@ -123,5 +123,6 @@ def _watch(scene) -> parameters.Watch:
     for emitter in scene.emitters():
         shape = emitter.get_shape()
         params = parameters.traverse(shape if shape is not None else emitter)
-        pairs += [(params, key) for key in params.keys() if not key.startswith("bsdf.")]
+        pairs += [(params, key) for key in params.keys()
+                  if not key.startswith("bsdf.") and not key.endswith("sampling_weight")]  # fmt: skip
     return parameters.Watch(pairs)

@@ -56,8 +56,10 @@ class Watch:
         arrays, others = [], []
         for params, key in self.pairs:
             v = read(params, key)
+            if hasattr(type(v), "inverse_transpose"):  # a transformation
+                v = v.matrix
             if v is not None and dr.is_jit_v(v):
-                arrays.append(v if dr.is_array_v(v) else v.matrix)
+                arrays.append(v)
             else:
                 others.append(v.tobytes() if hasattr(v, "tobytes") else text(v))
         return arrays, others

@@ -158,6 +158,8 @@ def _reflects(bsdf) -> str:
 
 def _material(bsdf) -> tuple[str, bool, list[float]]:
     """What a BSDF reflects, whether it is textured, and least and largest alpha, as far as they can be read."""
+    if bsdf.class_name() == "SmoothDiffuse":  # without a look at its parts, as each of ten thousand lamps may have one
+        return _reflects(bsdf), bool(int(bsdf.flags()) & int(mi.BSDFFlags.SpatiallyVarying)), []
     params = parameters.traverse(bsdf)
     textures = [node for node in params.hierarchy if isinstance(node, mi.Texture)]
     # A MeshAttribute says that it does not vary

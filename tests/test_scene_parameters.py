@@ -227,6 +227,16 @@ def test_edits_are_noticed_whatever_else_a_light_has():
     assert [edits.changed() for _ in range(2)] == [True, False]
 
 
+def test_the_smallest_step_of_a_shape_is_noticed():
+    scene = ball({"type": "diffuse"})
+    params = parameters.traverse(scene.shapes()[0])
+    edits = parameters.Watch([(params, "to_world")])
+    assert [edits.changed() for _ in range(2)] == [True, False]
+    params["to_world"] = params["to_world"] @ mi.Transform4f().translate([1e-7, 0, 0])
+    params.update()
+    assert [edits.changed() for _ in range(2)] == [True, False]
+
+
 def test_what_has_no_value_cannot_be_changed_from_frame_to_frame():
     scene = ball({"type": "hair"}, camera=CAMERA)
     with pytest.raises(InputError, match=r"sigma_a: the scene has no such parameter; .*ball\.bsdf"):
