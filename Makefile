@@ -37,14 +37,14 @@ picture: demo  ## the README's picture, of the demo's frames
 	$(BIN)/python -m mi_neural.bench.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
 	    out/demo/path_$(k) out/demo/nirc_$(k))
 
-BENCH := -i path -i nirc -i nrc -i nirc:termination=auto -i nirc_two_level --seconds 1 --steady 64 --frame-seconds 0.25 \
+BENCH := -i path -i nirc -i nrc -i neural_path -i nirc_two_level --seconds 1 --steady 64 --frame-seconds 0.25 \
     --repeats 3 --denoise
 
 bench: $(STAMP)  ## integrators on our own scenes: tables and report in out/bench; under 20 minutes on two cores, goes on where stopped
 	$(BIN)/mi-neural compare --scenes scenes $(BENCH) --size 160x90,144x144 -o out/bench
 
 GALLERY := $(BIN)/mi-neural compare
-PATHS := -i path -i nirc -i nrc -i nrc:termination=auto -i nirc_two_level -i nirc_two_level:mode=progressive \
+PATHS := -i path -i nirc -i nrc -i neural_path -i nirc_two_level -i nirc_two_level:mode=progressive \
     -i plain_path:light_sampler.type=nvc_lights --steady 200 --frame-seconds 0.25
 DIRECT := -i path -i plain_path:light_sampler.type=power_lights -i plain_path:light_sampler.type=nvc_lights -i restir_di \
     -i nvc_direct -i nvc_direct:mode=neural -D max_depth=2 --steady 200 --frame-seconds 0.25 --reference-spp 512

@@ -14,7 +14,7 @@ llvm.prepare()  # before Dr.Jit is imported, here or anywhere below
 from .llvm import LLVMError  # noqa: E402
 from .registration import register, variant_problem  # noqa: E402
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Public names, and the modules that are imported when they are first used
 _LAZY = {
