@@ -215,7 +215,8 @@ class VisibilityCache:
             n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
             width=32, n_hidden=2, n_outputs=n_outputs, leak=0.01,
         )  # fmt: skip
-        self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high, resolution=2)  # points in the air are few to a cell
+        # Large cells: points in the air are few
+        self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high, resolution=2)
 
     def _records(self, scene, sensor, table, groups, seeds):
         """Training points of some steps, one for each of `seeds`, and what they see: (points, step by step; 1 or 0 by
