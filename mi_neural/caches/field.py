@@ -409,7 +409,7 @@ class TrainedField:
 
         Raises `CacheFileError` for a file that is missing, cut short, not of such a field, or of another version.
         """
-        header, arrays = files.read(path, cls.KIND, (*cls.UNKNOWN, "extra.ages.places.position"))
+        header, arrays = files.read(path, cls.KIND, cls.UNKNOWN)
         extra = {k.removeprefix("extra."): arrays.pop(k) for k in list(arrays) if k.startswith("extra.")}
         try:
             field = cls.make(header)

@@ -159,7 +159,7 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
         features = field.encode(records.position, records.normal, averaged=False)  # looked up as the prediction's
         mean_local = local_mean(field, features, records, training.n_local, sampler)
     said = dr.detach(p)
-    dr.schedule(said)
+    dr.schedule(said, mean_local)  # or the gradient by way of the shortcut would ask for the mean again
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
     error = loss.local_relative_l2(p, y, mean_local, epsilon)
     total = field.step(dr.select(records.valid, error, 0) / n_valid, learning_rate, decay)

@@ -215,7 +215,8 @@ class VisibilityCache:
             n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
             width=32, n_hidden=2, n_outputs=n_outputs, leak=0.01,
         )  # fmt: skip
-        self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high)
+        # Large cells: points in the air are few
+        self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high, resolution=2)
 
     def _records(self, scene, sensor, table, groups, seeds):
         """Training points of some steps, one for each of `seeds`, and what they see: (points, step by step; 1 or 0 by
@@ -240,7 +241,7 @@ class VisibilityCache:
             dr.eval(visible)
         return x, visible
 
-    def _step_plain(self, field, ages, x, visible, rate_factor):
+    def _step_plain(self, field, x, visible, ages, rate_factor):
         with dr.suspend_grad():
             learning_rate, decay = pace(self.training, ages, x, mi.Bool(True), rate_factor, field)
         visible = mi.TensorXf(visible, shape=(field.shape.n_outputs, dr.width(x)))
@@ -265,7 +266,7 @@ class VisibilityCache:
                 for k in range(n_steps):
                     self._step_watch.begin(self.field.optimizer)
                     loss = self._step(
-                        self.field, self.ages, *_part(points, k, n_steps), dr.opaque(mi.Float, self.rate_factor)
+                        self.field, *_part(points, k, n_steps), self.ages, dr.opaque(mi.Float, self.rate_factor)
                     )
                     self.steps += 1
                     self._watch(loss[0])

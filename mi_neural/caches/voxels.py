@@ -20,6 +20,8 @@ FACTORS = 1, 2654435761, 805459861, 3674653429
 FARTHEST = 2.0**30
 #: Steps after which a place counts as half known, see `Ages`.
 HALF_KNOWN = 100.0
+#: Stands in files for a position that is not known.
+NOWHERE = 3e38
 
 
 def check_box(box_min: np.ndarray, box_max: np.ndarray) -> None:
@@ -161,8 +163,8 @@ class Ages:
     LEARNED = ("steps", "first", "recent", "usual", "total", "novelty", "places.position", "places.view", "places.age")
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that training has changed."""
-        return {name: np.array(attrgetter(name)(self)) for name in self.LEARNED}
+        """All that training has changed, in finite numbers."""
+        return {name: np.nan_to_num(np.array(attrgetter(name)(self)), nan=NOWHERE) for name in self.LEARNED}
 
     def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         """Go on from :meth:`arrays`. Raises ``KeyError`` or ``ValueError`` for such that make no sense."""
@@ -171,5 +173,7 @@ class Ages:
             raise ValueError("the steps of places are not those of this grid")
         for name in self.LEARNED:
             owner, attribute = (self.places, name.split(".")[1]) if "." in name else (self, name)
-            setattr(owner, attribute, type(getattr(owner, attribute))(np.float32(arrays[name])))
+            values = np.float32(arrays[name])
+            values = np.where(values == np.float32(NOWHERE), np.float32(math.nan), values)
+            setattr(owner, attribute, type(getattr(owner, attribute))(values) + dr.opaque(mi.Float, 0))
         dr.make_opaque(self.steps, self.first, self.recent, self.usual, self.total, self.novelty, self.places)
