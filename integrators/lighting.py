@@ -57,6 +57,8 @@ class LightSamplingIntegrator(FilmIntegrator):
             self.lights = self.light_sampler.lights(scene, recordable(sensor, self.film_state.n_bound), train)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        if self.film_state.entered:  # Mitsuba's own render() comes back here once
+            return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
         if not (self.differentiable and _differentiates()):
             return super().render(scene, sensor, seed, spp, develop, evaluate)
         sensor = self._checked(scene, sensor, spp)

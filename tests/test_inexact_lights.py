@@ -14,7 +14,7 @@ from mi_neural.integrators import planning
 from mi_neural.lights.inexact import inexact
 from mi_neural.lights.table import LightTable
 from mi_neural.plan import LightNoise, Request, SceneFacts, of_integrator, of_sampler
-from mi_neural.transport import vertex
+from mi_neural.render import vertex
 
 BLACK = {"type": "diffuse", "reflectance": 0.0}
 PLACE = at(0.3, 0.2, 2).rotate([0.6, 0.8, 0], 40)

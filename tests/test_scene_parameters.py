@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mi_neural import parameters, plan
-from mi_neural.measure.load import InputError
-from mi_neural.measure.sequence import Sequence
+from mi_neural.bench.load import InputError
+from mi_neural.bench.sequence import Sequence
 from mi_neural.plan import SceneFacts
 
 DIFFUSE = {"type": "diffuse"}
