@@ -195,7 +195,8 @@ def test_trained_image_under_every_light_is_that_of_path(mixed):
 
 def test_glass_and_mirrors_show_what_path_shows():
     """Mirrors and glass are followed; light met through them is in the records, wherever a path ended."""
-    assert_like_path(room(), nrc(train_samples=1024), 0.03, 0.25, 64)  # 3 standard errors of both
+    # 3 % are 6 standard errors of both; four other trainings, with 1,024 samples, were off by -1.1 to -0.1 %
+    assert_like_path(room(), nrc(train_samples=1024), 0.03, 0.25, 256)
 
 
 def test_room_of_mirrors_without_a_smooth_surface_renders():
