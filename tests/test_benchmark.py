@@ -213,6 +213,44 @@ def test_size_overrides_film_and_crop(tmp_path):
         load.load_scene(str(scene), None, {"foo": "1"})
 
 
+def boxes(path, *shapes: str) -> str:
+    """A scene of shapes of one material."""
+    material = '<bsdf type="twosided" id="white"> <bsdf type="diffuse"/> </bsdf>'
+    path.write_text(f"""<scene version="3.0.0"> <sensor type="perspective"/> <emitter type="constant"/> {material}
+        {" ".join(shapes)} </scene>""")
+    return str(path)
+
+
+WHITE = '<ref id="white" name="bsdf"/>'
+METER = """<shape type="rectangle"> {} <sensor type="irradiancemeter"> <film type="hdrfilm">
+    <integer name="width" value="1"/> <integer name="height" value="1"/> <rfilter type="box"/> </film>
+    </sensor> </shape>"""
+
+
+def test_scenes_are_merged_unless_they_cannot_be(tmp_path):
+    """Mitsuba 3.9.1 refuses to join a rectangle and a cube with flipped normals, and makes equal sensors one, which it
+    then refuses on two shapes."""
+    cubes = [f'<shape type="cube" id="c{k}"> {WHITE} </shape>' for k in range(3)]
+    file = boxes(tmp_path / "a.xml", *cubes)
+    merged, apart = load.load_scene(file), load.load_scene(file, merge=False)
+    assert merged.merged and len(merged.scene.shapes()) == 1
+    assert not apart.merged and {s.id() for s in apart.scene.shapes()} == {"c0", "c1", "c2"}
+    flipped = f'<shape type="cube"> <boolean name="flip_normals" value="true"/> {WHITE} </shape>'
+    plane = f'<shape type="rectangle"> {WHITE} </shape>'
+    loaded = load.load_scene(boxes(tmp_path / "b.xml", plane, flipped))
+    assert not loaded.merged and len(loaded.scene.shapes()) == 2
+    move = '<transform name="to_world"> <translate x="3"/> </transform>'
+    assert not load.load_scene(boxes(tmp_path / "c.xml", METER.format(""), METER.format(move))).merged
+
+
+def test_what_is_wrong_is_said_where_merging_is_not_why(tmp_path):
+    with pytest.raises(load.InputError, match=r"cannot load .*no\.ply"):
+        mesh = '<shape type="ply"> <string name="filename" value="no.ply"/> </shape>'
+        load.load_scene(boxes(tmp_path / "a.xml", mesh))
+    with pytest.raises(load.InputError, match=r"no key 'depht'"):
+        load.load_scene("cornell_box", integrator_keys={"depht": 3})
+
+
 def test_keys_are_typed():
     spec = load.parse_integrator("nirc:a=8,b=0.5,c=true,d=text,e.f=1e-3")
     assert spec.keys == {"a": 8, "b": 0.5, "c": True, "d": "text", "e.f": 1e-3}

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_cache import register
-from test_benchmark import KEYS, has_denoiser
+from test_benchmark import KEYS, WHITE, boxes, has_denoiser
 from typer.testing import CliRunner
 
 from mi_neural import scenes
@@ -52,6 +52,13 @@ def test_render_writes_image_metadata_and_json():
     assert image.size == (16, 12) and image.metadata["integrator"] == "path" and image.metadata["spp"] == 2
     assert image.metadata["mean"] == pytest.approx(facts["mean"], rel=1e-5) == pytest.approx(image.rgb.mean(), rel=1e-5)
     assert facts["ns_per_sample"] == pytest.approx(1e9 * facts["seconds_render"] / (16 * 12 * 2))
+
+
+def test_scene_whose_meshes_cannot_be_joined_is_rendered(tmp_path):
+    """As exporters write them; Mitsuba itself: "Mesh::merge(): the two meshes are incompatible"."""
+    plane, flipped = (f'<shape type="{kind}"> {WHITE} </shape>' for kind in ("rectangle", "cube"))
+    flipped = flipped.replace(WHITE, f'<boolean name="flip_normals" value="true"/> {WHITE}')
+    run("render", boxes(tmp_path / "b.xml", plane, flipped), *SMALL, "-i", "path", "--spp", 1, "-o", "a.exr")
 
 
 def test_scene_is_a_name_or_a_file_and_sizes_fit():

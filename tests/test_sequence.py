@@ -1,5 +1,6 @@
 """Sequences: parameters by frame, what is refused, frames and references on disk, going on after an interruption."""
 
+import importlib
 import json
 from itertools import pairwise
 from pathlib import Path
@@ -441,6 +442,25 @@ def test_the_command_writes_everything(command):
     command(*arguments)
     assert (out / "path" / "frame_0004.exr").is_file() and len(rows_of(out / "path")) == 6
     assert (out / "path" / "frame_0001.exr").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("change, merges", [
+    ((), [True]), (("--change", "camera.to_world=translate(0.1*frame,0,0)@value"), [False, True]),
+    (("--change", "emitter.radiance.value=value*(1-0.2*frame)"), [False]),
+])  # fmt: skip
+def test_meshes_are_joined_only_where_nothing_but_cameras_changes(command, monkeypatch, change, merges):
+    """Joined ones lose their names, and what is done to one of two equal materials would be done to both."""
+    found = []
+
+    def load_scene(*arguments, merge=True):
+        found.append(merge)
+        return known(*arguments, merge=merge)
+
+    known = load.load_scene
+    monkeypatch.setattr(load, "load_scene", load_scene)
+    monkeypatch.setattr(importlib.import_module("mi_neural.commands.sequence"), "MANY_SHAPES", 1)
+    command("cornell_box", "--size", "8x8", "-i", "path", "--frames", 2, "--no-reference", *change, "-o", "out")
+    assert found == merges
 
 
 def test_the_command_without_references_and_when_interrupted(command):

@@ -122,6 +122,16 @@ def keys(params) -> dict[str, Callable[[], Parameter]]:
     return found
 
 
+def of_sensors(scene, names) -> bool:
+    """Whether the parameters of these names all belong to sensors, so that joined meshes and materials do no harm."""
+    import mitsuba as mi
+
+    params = mi.traverse(scene)
+    known = keys(params)
+    nodes = [params.properties.get(find_key(known, name), (None, None, None, 0))[2] for name in names]
+    return all(isinstance(node, mi.Sensor) for node in nodes)
+
+
 def find_key(known, key: str) -> str:
     """The key that `key` stands for: itself, or the only one that ends in it, `.value` and `.data` left out or not.
 

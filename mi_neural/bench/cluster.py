@@ -428,7 +428,7 @@ def frames_of(
     """What has the workers render frames for a :class:`sequence.Run`; `texts`: the changes as typed, `KEY=EXPR`."""
 
     def render(case: benchmark.Case, frames: range) -> Iterator[sequence.Frame]:
-        setup = jobs.Setup.of(loaded, case, size, merge=False)
+        setup = jobs.Setup.of(loaded, case, size, merge=loaded.merged)
         of_all = (setup, tuple(texts), over_time.frames, over_time.change_at)
         learned = jobs.cache_bytes(case.integrator)
         of_frames = [(jobs.Frame(*of_all, frame, plan.spp, plan.seed), learned) for frame in frames]

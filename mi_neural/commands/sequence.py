@@ -16,6 +16,8 @@ from mi_neural.commands import options
 
 DEFAULT_FRAMES = 60
 DEFAULT_REFERENCE_SPP = 256
+#: A scene of more shapes is loaded anew with its meshes joined, where only cameras move.
+MANY_SHAPES = 200
 CHANGE_HELP = """a parameter of mi.traverse(scene), or the end of its name, as an expression of value (the original
 one), frame, n, t (0 to 1), after (1 from --change-at on), s (frames since): "sun.direction=rotated(value, [0,1,0],
 40*after)", "lamp.radiance=value*(1+t)", "ball.to_world=translate(0, 0.1*frame, 0) @ value" (meshes too), "wall.data=
@@ -84,7 +86,9 @@ def sequence(
     terminal.require_folder(output)
 
     terminal.set_variant(variant)
-    loaded = load.load_scene(scene, wanted_size, parameters, merge=False)
+    loaded = load.load_scene(scene, wanted_size, parameters, merge=not functions)
+    if functions and len(loaded.scene.shapes()) > MANY_SHAPES and changes.of_sensors(loaded.scene, functions):
+        loaded = load.load_scene(scene, wanted_size, parameters)
     crops = terminal.parse_crops(crop, loaded.size)
     cases = benchmark.make_cases(loaded, specs, keys)
     over_time = sequences.Sequence(loaded.scene, functions, frames, change_at)
