@@ -394,7 +394,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             def candidate(i, kept, sampler):
                 u = (mi.Float(i) + sampler.next_1d()) * (1 / n_candidates)
                 choice = lights.choose(si, n, transmits, u, sampler, mi.UInt32(0), active)
-                sampler = choice.sampler
+                sampler = choice.advanced(sampler)
                 uv = sampler.next_2d()
                 f, _ = self.contribution(scene, power, si, choice.index, uv, active & (choice.weight > 0))
                 target = dr.mean(f)

@@ -34,14 +34,18 @@ class Choice:
     weight   what its contribution counts: 1 / pmf, or the weight of a resampled candidate, whose mean that is
     pmf      probability of the light, for MIS weights (with resampling: of it as a candidate)
     pmf_hit  the same of the light `hit`
-    sampler  the sampler that was given, advanced by what was drawn
+    sampler  the sampler that was given, advanced by what was drawn; None where nothing was
     """
 
     index: mi.UInt32
     weight: mi.Float
     pmf: mi.Float
     pmf_hit: mi.Float
-    sampler: object
+    sampler: object = None
+
+    def advanced(self, sampler):
+        """The sampler to go on with, `sampler` being the one that was given."""
+        return sampler if self.sampler is None else self.sampler
 
 
 class UniformLights:

@@ -202,7 +202,7 @@ def direct_light(scene, lights, path: PathState, bsdf, found: Bounce, numbers: N
         hit, emits = table.index_of(scene, found.si, found.followed)
         n, transmits = vertex.receiver(si, bsdf)
         choice = lights.choose(si, n, transmits, numbers.light, sampler, hit, active)
-        sampler = choice.sampler
+        sampler = choice.advanced(sampler)
         ds, light, pdf = table.sample(scene, si, choice.index, numbers.point, smooth & (choice.weight > 0))
         light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
