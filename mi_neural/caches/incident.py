@@ -49,7 +49,9 @@ class Training:
                      a closed room in a few frames and do not build on the cache's own errors (manual, 6_measured)
     n_tail           cache queries at the end of a path
     n_local          queries that estimate the local mean of `loss.local_relative_l2`
-    epsilon          of that loss, over the squared mean target of the scene
+    epsilon          of that loss, over the squared mean target of the scene. Where the local mean, itself a prediction,
+                     is the whole norm, targets count less when it overshoots, and the cache drifts: a room lit through
+                     a slit +8 to +14 % after 200 to 600 steps with 0.03, within 1 % with 10 (manual, 6_measured)
     learning_rate    of Adam, at the start; see `rate`
     ema_decay        longest horizon of the averaged copy: 1 / (1 - ema_decay) steps
     last_rate        share of the learning rate that it falls to
@@ -59,7 +61,7 @@ class Training:
     n_vertices: int = 8
     n_tail: int = 2
     n_local: int = 2
-    epsilon: float = 0.03
+    epsilon: float = 10.0
     learning_rate: float = 1e-2
     ema_decay: float = 0.99
     last_rate: float = 0.1
