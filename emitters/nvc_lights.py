@@ -140,7 +140,7 @@ class NVCLightSampler(LightSampler):
             return
         steps = 0 if self.freeze else self.train_steps if self.begun else self.train_frames
         self.begun = True
-        self.cache.train(scene, sensor, self.sampler.table, self.sampler.groups, steps)
+        self.cache.train(scene, sensor, self.sampler.table, self.sampler.groups, frames=steps)
         self.sampler.field = self.cache.field
 
     def statistics(self) -> dict:

@@ -171,7 +171,7 @@ class CacheIntegrator(FilmIntegrator):
 
     @property
     def bound_field(self):
-        return self.cache.asked if self.needs_cache else None
+        return self.cache.queried if self.needs_cache else None
 
     @property
     def trains(self) -> bool:
@@ -363,7 +363,7 @@ class CacheIntegrator(FilmIntegrator):
 
     def measure_query(self, n: int = 2**16) -> float:
         """Nanoseconds per cache query, as :meth:`probe` asks it. Also kept for :meth:`statistics`."""
-        field = self.cache.asked
+        field = self.cache.queried
         if field is None:
             raise RuntimeError(f"{self.plugin}: there is no cache yet; render an image or call train() first")
 

@@ -188,7 +188,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             self.lights = self.light_sampler.lights(scene, sensor, train)
             if self.kind == "radiance":
                 steps = self.train_steps if self.cache.steps else self.train_frames
-                self.cache.train(scene, sensor, self.lights, steps if train and not self.freeze_cache else 0)
+                self.cache.train(scene, sensor, self.lights, frames=steps if train and not self.freeze_cache else 0)
         if self.lights is None and (self.predicts or self.channels):
             self.lights = self._only_light(scene, sensor, train)
         knows = getattr(self.lights, "field", None) is not None
@@ -224,7 +224,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
             self.only_light = VisibilityCache(settings.cache.training, seed=self.seed)
         steps = settings.train_steps if self.only_light.steps else settings.train_frames
         with dr.resume_grad():
-            self.only_light.train(scene, sensor, table, groups, steps if train and not settings.freeze else 0)
+            self.only_light.train(scene, sensor, table, groups, frames=steps if train and not settings.freeze else 0)
         return VisibleLights(table, groups, self.only_light.field)
 
     # -------------------------------------------------------------------------------------------------------------

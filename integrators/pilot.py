@@ -133,7 +133,7 @@ class Choice:
     def know_alpha(self, integrator, scene, sensor, by_place: bool) -> None:
         """See that there is an α by place, where one is asked for: a cache from elsewhere has none yet."""
         if by_place and self.may_ask and integrator.cache.statistics.get("alpha") is None:
-            integrator.cache.look(scene, sensor, integrator.state.lights, LOOK_FRAMES)
+            integrator.cache.compare(scene, sensor, integrator.state.lights, LOOK_FRAMES)
 
     def measure(self, integrator, scene, sensor) -> None:
         """Compare the candidates on `scene` and take the best; again whenever the cache is twice as old."""

@@ -133,10 +133,10 @@ def test_training_is_recorded_a_constant_number_of_times(mode):
     cache = IncidentCache(Training(n_paths=64), SHAPE, blend=mode)
     for _ in range(4):
         cache.train_frame(scene, sensor)
-    known = cache._frame.n_recordings
+    known = cache.recordings()["frame"]
     for _ in range(4):
         cache.train_frame(scene, sensor)
-    assert cache._frame.n_recordings == known <= 3
+    assert cache.recordings()["frame"] == known <= 3
 
 
 def test_training_does_not_depend_on_who_watches():
@@ -156,16 +156,16 @@ def test_checkpoint_takes_the_grid_back():
     cache = IncidentCache(Training(n_paths=64), SHAPE, blend="reliability")
     cache.train(scene, sensor, frames=4)
     kept = cache.checkpoint()
-    grid = cache.asked.grid
+    grid = cache.queried.grid
     known, weights = [np.array(v) for v in grid.sums], cache.field.snapshot()
     cache.train(scene, sensor, frames=3)
     assert grid.updates[0] == 7
     cache.rollback(kept)
     assert grid.updates[0] == 4 and all(np.array_equal(a, np.array(b)) for a, b in zip(known, grid.sums, strict=True))
     assert same(weights, cache.field.snapshot())
-    np.testing.assert_array_equal(np.array(cache.asked.fast.grid.data), weights["current.grid"])
+    np.testing.assert_array_equal(np.array(cache.queried.fast.grid.data), weights["current.grid"])
     cache.rollback(None)
-    assert cache.asked.grid.updates[0] == 0
+    assert cache.queried.grid.updates[0] == 0
 
 
 def test_rollback_brings_back_the_field_that_a_restart_replaced():
@@ -179,7 +179,7 @@ def test_rollback_brings_back_the_field_that_a_restart_replaced():
     cache.train(scene, sensor, frames=2)
     assert cache.field is not field and cache.field.scale[0] > 1e3 * scale
     cache.rollback(kept)
-    assert cache.field is cache.asked.field is field and field.scale[0] == scale
+    assert cache.field is cache.queried.field is field and field.scale[0] == scale
 
 
 # ---------------------------------------------------------------- integrators
@@ -255,4 +255,4 @@ def test_every_measure_runs(measure, by_normal):
     integrator.train(scene, 4)
     image = np.array(integrator.render(scene, spp=4))
     assert np.isfinite(image).all() and 0 <= integrator.statistics()["reliability"] <= 1
-    assert integrator.cache.asked.grid.constants.measure == measure
+    assert integrator.cache.queried.grid.constants.measure == measure

@@ -59,7 +59,7 @@ def assert_alike(a: dict, b: dict, rtol=2e-3) -> None:
 
 
 def whole(cache) -> dict:
-    grid = getattr(cache.asked, "grid", None)
+    grid = getattr(cache.queried, "grid", None)
     return cache.field.arrays() | (grid.arrays() if grid is not None else {})
 
 
@@ -115,10 +115,10 @@ def test_statistics_of_another_reliability_are_left_out(cube, tmp_path):
 
     new = other()
     new.resume(*new.read(tmp_path / "a.npz"))
-    assert new.steps == 8 and int(new.asked.grid.updates[0]) == 0
+    assert new.steps == 8 and int(new.queried.grid.updates[0]) == 0
     plain = incident()
     plain.resume(*plain.read(tmp_path / "a.npz"))
-    assert plain.asked is plain.field
+    assert plain.queried is plain.field
 
 
 @pytest.mark.parametrize("change", [

@@ -141,7 +141,7 @@ def test_trained_as_the_network_saved_loaded_and_reset(kind, cube, tmp_path, rng
     cache = cache_of(kind)
     cache.train(*cube, frames=12)
     assert cache.steps == 12 and np.isfinite(cache.history).all() and cache.statistics["recoveries"] == 0
-    assert cache._frame.n_recordings <= 3  # as the network's
+    assert cache.recordings()["frame"] <= 3  # as the network's
     with dr.suspend_grad():
         w = directions(512, rng)
         found = answers(cache.field, points(512, rng, -0.8, 0.8), w)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from hard_cases import room
 
-from mi_neural.caches.divergence import LATER, LONGEST, LONGEST_LATER, StepWatch, healthy
-from mi_neural.caches.field import attach_adam
 from mi_neural.caches.incident import IncidentCache, Training, trace_records
+from mi_neural.caches.optimizer import LATER, LONGEST, LONGEST_LATER, Stride, attach_adam, descend
 from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining, trace_outgoing
 from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining
 from mi_neural.lights import clusters
@@ -66,7 +65,7 @@ class Visibility:
         self.cache = VisibilityCache(VisibilityTraining(first_rate=0.05 * factor, last_rate=0.001 * factor))
 
     def train(self, steps=1):
-        self.cache.train(*self.place, self.table, self.groups, steps)
+        self.cache.train(*self.place, self.table, self.groups, frames=steps)
 
     @property
     def recoveries(self) -> int:
@@ -140,32 +139,45 @@ def test_rate_that_rises_a_hundredfold_in_the_middle_is_recovered_from(kind, pla
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_steps_of_healthy_training_are_far_from_the_limit(kind, place, monkeypatch):
-    lengths = []
-    original = StepWatch.step
-
-    def step(self, *optimizers):
-        lengths.append(original(self, *optimizers))
-        return lengths[-1]
-
-    monkeypatch.setattr(StepWatch, "step", step)
-    run = KINDS[kind](place)
-    run.train(60)
+def test_steps_of_healthy_training_are_far_from_the_limit(kind, place):
+    run, lengths = KINDS[kind](place), []
+    for _ in range(60):
+        run.train()
+        lengths.append(run.cache.field.stride.length[0])
     first, later = max(lengths[:LATER]), max(lengths[LATER:])
     print(f"{kind}: the longest steps are {first:.3f} and later {later:.3f} of the weights")
-    assert len(lengths) == 60 and run.recoveries == 0
+    assert min(lengths) > 0 and run.recoveries == 0
     assert first < 0.7 * LONGEST and later < 0.7 * LONGEST_LATER
+    assert run.cache.field.stride.longest[0] == LONGEST_LATER
 
 
-@pytest.mark.parametrize("factor, well", [
-    (1.0, True), (1.5, True), (2.5, False), (-0.5, False), (np.nan, False), (np.inf, False),
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_image_sees_a_step_that_is_too_long(kind, place):
+    """The step is refused where it is made; that it was is read later, and undone then."""
+    run = KINDS[kind](place)
+    run.train(LATER + 4)
+    known, before = run.answers(), run.recoveries
+    run.cache.rate_factor = 1e4
+    run.train()
+    np.testing.assert_allclose(run.answers(), known, rtol=0.2, atol=0.2 * known.mean())  # the grid may have moved
+    assert run.recoveries == before + 1 and run.cache.rate_factor == 0.5e4
+
+
+@pytest.mark.parametrize("rate, longest, well", [
+    (0.1, 0.25, True), (1.0, 0.25, False), (1.0, 0.4, True), (np.nan, np.inf, False), (np.inf, 1e30, False),
 ])  # fmt: skip
-def test_length_of_a_step_is_that_of_the_change_over_the_weights(factor, well):
-    weights = {"grid": mi.Float(0.0, 0.0), "a": mi.Float(3.0, 4.0)}
-    watch = StepWatch()
-    watch.begin(attach_adam(weights))
-    length = watch.step(attach_adam({"grid": mi.Float(1e9, 0.0), "a": mi.Float(3.0, 4.0) * factor}))
-    assert healthy(length, 1) is well
-    assert not healthy(0.5, LATER + 1) and healthy(0.2, LATER + 1)
-    if np.isfinite(factor):
-        assert length == pytest.approx(abs(factor - 1), rel=1e-5)
+def test_step_longer_than_allowed_changes_nothing_and_says_so(rate, longest, well):
+    """Adam's first step moves each weight by the learning rate: two weights (3, 4) by √2 of it, over 5."""
+    optimizer = attach_adam({"a": mi.TensorXf([3.0, 4.0]), "grid": mi.Float([1.0, 1.0])})
+    averaged = {k: dr.detach(type(v)(v)) for k, v in optimizer.items()}
+    stride = Stride.make(longest)
+    losses = dr.square(optimizer["a"].array) + dr.square(optimizer["grid"])
+    average, loss = descend(optimizer, losses, averaged, mi.Float(rate), mi.Float(0.5), stride)
+    moved = np.array(dr.detach(optimizer["a"].array)) - [3, 4]
+    if well:
+        np.testing.assert_allclose(moved, -rate, rtol=1e-3)
+        np.testing.assert_allclose(np.array(average["a"].array), [3 - rate / 2, 4 - rate / 2], rtol=1e-3)
+        assert stride.length[0] == pytest.approx(rate * 2**0.5 / 5, rel=1e-3) and loss[0] == pytest.approx(27)
+    else:
+        assert not moved.any() and np.isnan(loss[0])
+        assert np.array_equal(np.array(average["a"].array), [3, 4])

@@ -260,7 +260,7 @@ def test_settled_means_the_median_loss_has_stopped_falling():
         ([5.0] * 500 + [1.0] * 128, True), ([1.0] * 64 + [1.1] * 64, True),
         ([1.0, 1.0, 1e4, 1.0] * 32, True),
     ):  # fmt: skip
-        cache.history = list(history)
+        cache._history = list(history)
         assert bool(cache.settled()) == expected, history[:3]
 
 
@@ -424,5 +424,5 @@ def test_half_precision_trains_in_frozen_steps(monkeypatch, cube):
     """As on a GPU: weights packed in half precision, and a frozen step that queries them while it trains them."""
     monkeypatch.setattr(Weights.__init__, "__defaults__", (True,))
     cache = IncidentCache(Training(n_paths=64, n_vertices=3), FieldShape(n_levels=2, width=16))
-    losses = [cache.train_frame(*cube) for _ in range(3)]
-    assert cache.field.averaged.half and np.isfinite(losses).all()
+    cache.train(*cube, frames=3)
+    assert cache.field.averaged.half and len(cache.history) == 3 and np.isfinite(cache.history).all()

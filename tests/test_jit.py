@@ -42,7 +42,7 @@ def running(sphere):
 
 def recordings(integrator) -> list[int]:
     passes = integrator.film_state.passes.recorded.values()
-    return [integrator.cache._frame.n_recordings, *(p.n_recordings for p in passes)]
+    return [integrator.cache.recordings()["frame"], *(p.n_recordings for p in passes)]
 
 
 def test_number_of_recordings_is_constant_over_frames(sphere, running):

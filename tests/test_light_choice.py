@@ -527,5 +527,5 @@ def test_no_number_is_used_twice_where_lights_are_looked_at(mixed, counted, monk
     monkeypatch.setattr(visibility, "PathSampler", counted)
     monkeypatch.setattr(visibility, "_numbers", counted.make)
     cache = visibility.VisibilityCache(visibility.VisibilityTraining(n_points=32))
-    cache.train(scene, camera, table, make_groups(table, 6), 2)
+    cache.train(scene, camera, table, make_groups(table, 6), frames=2)
     assert len(counted.uses) == 2 + 1 + 2 * 2 and counted.most_uses() == 1

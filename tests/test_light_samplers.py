@@ -154,7 +154,7 @@ def test_network_that_says_nonsense_gives_the_same_image(place, kind, nonsense):
     integrator = path_with("cells" if kind == "envmap" else "trained")
     sampler = integrator.light_sampler
     lights = sampler.lights(scene, scene.sensors()[0])
-    weights = lights.field.weights
+    weights = lights.field.averaged
     rng = np.random.default_rng(1)
     parameters = {k: np.array(v) for k, v in weights.parameters().items()}
     if nonsense == "inverted":
@@ -390,9 +390,9 @@ def test_light_that_is_dimmed_is_not_recorded_anew(key):
             with dr.suspend_grad():
                 dr.eval(it.render(scene, spp=1, seed=k))
         counts.append([
-            *(p.n_recordings for p in nirc_.film_state.passes.recorded.values()), nirc_.cache._frame.n_recordings,
+            *(p.n_recordings for p in nirc_.film_state.passes.recorded.values()), nirc_.cache.recordings()["frame"],
             *(f.n_recordings for f in plain.film_state.passes.recorded.values()),
-            plain.light_sampler.cache._step.n_recordings,
+            plain.light_sampler.cache.recordings()["frame"],
         ])  # fmt: skip
     print(counts[0], counts[-1])
     assert counts[-1] == counts[3] and max(counts[-1]) <= 3

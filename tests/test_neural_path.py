@@ -309,7 +309,8 @@ def test_older_name_still_works_and_says_the_new_one(plugin, keys, box, capfd):
     old = mi.load_dict({"type": plugin, **SMALL, "termination": "auto", **keys})
     assert "type: neural_path" in "".join(capfd.readouterr())
     new = auto(**({"channels": "traced"} if keys else {}))
-    np.testing.assert_allclose(render(box, old, 4), render(box, new, 4), rtol=0.03, atol=1e-3)  # trained: equal but for the order of sums
+    # Trained: equal but for the order of sums
+    np.testing.assert_allclose(render(box, old, 4), render(box, new, 4), rtol=0.03, atol=1e-3)
 
 
 # ---------------------------------------------------------------- all together
@@ -398,7 +399,7 @@ def test_frozen_functions_are_not_recorded_again_and_preparing_changes_nothing(b
     integrator = auto(train_frames=4, train_steps=1, train_samples=256)
     for k in range(4):
         render(box, integrator, 2, k)
-    functions = [integrator.cache._frame, *integrator.film_state.passes.recorded.values()]
+    functions = [integrator.cache.recorded("frame"), *integrator.film_state.passes.recorded.values()]
     recorded = [f.n_recordings for f in functions]
     for k in range(6):
         render(box, integrator, 2, 10 + k)

@@ -308,7 +308,7 @@ def test_cache_is_shared_by_an_integrator_that_had_one_of_its_own(box):
     own.share_cache(biased)
     render(box, own, 1)
     assert own.cache.steps == 60
-    assert float(own.cache.asked.mean_sigma()[0]) > 0.05, "α is that of the cache which is in use"
+    assert float(own.cache.queried.mean_sigma()[0]) > 0.05, "α is that of the cache which is in use"
 
 
 def test_cache_of_no_one_or_of_other_sizes_is_not_shared(box):
@@ -368,7 +368,7 @@ def test_preparing_leaves_no_trace(box):
     assert integrator.cache.steps == 8
 
     def state():
-        moments = integrator.cache.asked.snapshot()
+        moments = integrator.cache.queried.snapshot()
         arrays = {k: np.array(v if not isinstance(v, (list, dict)) else 0) for k, v in moments.items()}
         facts = {k: v for k, v in integrator.statistics().items() if k not in ("ns_per_query", "seconds_pilot")}
         return integrator.cache.field.snapshot() | arrays, facts

@@ -9,7 +9,7 @@ import pytest
 from outgoing_bench import close, jit, learn, make, same, surfaces, truth
 
 from mi_neural.caches import encoding
-from mi_neural.caches.field import own_copy
+from mi_neural.caches.optimizer import own_copy
 from mi_neural.caches.outgoing import ALBEDO_MIN, OutgoingShape
 from mi_neural.render.frozen import undisturbed
 

@@ -77,9 +77,9 @@ def test_nirc_renders_with_it(sphere, nirc):
 def test_it_is_recorded_once(sphere, nirc):
     """The training step is frozen as the network's is: once recorded, which takes up to three goes, it is replayed."""
     nirc.train(sphere, 3)
-    before = nirc.cache._frame.n_recordings
+    before = nirc.cache.recordings()["frame"]
     nirc.train(sphere, 4)
-    assert nirc.cache._frame.n_recordings == before <= 3
+    assert nirc.cache.recordings()["frame"] == before <= 3
 
 
 def test_its_files_are_its_own(sphere, nirc, tmp_path):

@@ -207,10 +207,10 @@ def sphere():
 def test_what_is_left_out_is_not_built_and_everything_is(sphere, type_):
     spare, said = parts_of(sphere, type=type_)
     rich, all_said = parts_of(sphere, type=type_, plan="everything")
-    assert spare.light_sampler is None and spare.state.lights is None and spare.cache.asked is spare.cache.field
+    assert spare.light_sampler is None and spare.state.lights is None and spare.cache.queried is spare.cache.field
     assert "visibility_steps" not in spare.statistics() and not said["reliability"]["modelled"]
     assert rich.light_sampler.plugin == "nvc_lights" and rich.statistics()["visibility_steps"] > 0
-    assert isinstance(rich.cache.asked, Blend) and rich.cache.asked.grid is not None
+    assert isinstance(rich.cache.queried, Blend) and rich.cache.queried.grid is not None
     assert all_said["visibility"]["value"] == 1 and all_said["reliability"]["modelled"]
     assert "plan = ScenePlan" in str(spare) and "nothing" not in str(rich)
     if type_ == "nrc":

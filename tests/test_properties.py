@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as hnp
 
 from mi_neural.caches import encoding, loss
 from mi_neural.caches import reliability as rel
-from mi_neural.caches.field import attach_adam, descend
 from mi_neural.caches.incident import Training
+from mi_neural.caches.optimizer import attach_adam, descend
 from mi_neural.caches.schedule import Ramp
 from mi_neural.estimators import reservoir
 from mi_neural.estimators import spread as termination

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mi_neural.caches import reliability as rel
-from mi_neural.caches.field import own_copy
+from mi_neural.caches.optimizer import own_copy
 from mi_neural.caches.reliability import MEASURES, Reliability, ReliabilityGrid
 
 BOX = ([-1.0, 0.0, 2.0], [3.0, 2.0, 5.0])

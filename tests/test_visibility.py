@@ -115,8 +115,8 @@ def test_equal_seeds_give_equal_weights_and_others_do_not():
 
     def weights(seed):
         cache = VisibilityCache(VisibilityTraining(n_points=512), seed=seed)
-        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32), 8)
-        return {k: np.array(v, np.float64) for k, v in cache.field.weights.parameters().items()}
+        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32), frames=8)
+        return {k: np.array(v, np.float64) for k, v in cache.field.averaged.parameters().items()}
 
     a, b, c = weights(1), weights(1), weights(2)
     rms = [np.sqrt(np.mean(np.concatenate([(a[k] - x[k]).ravel() for k in a]) ** 2)) for x in (b, c)]
@@ -132,13 +132,14 @@ def test_steps_taken_together_are_those_taken_one_by_one():
     seen = []
     for calls in ((8, 1), (1,) * 9):
         cache = VisibilityCache(VisibilityTraining(n_points=256), seed=3)
-        points, step = [], cache._step
-        cache._step = lambda field, x, v, *a, points=points, step=step: (
+        points, step = [], cache.frame
+        cache.recordable = False
+        cache.frame = lambda field, x, v, *a, points=points, step=step: (
             points.append(np.vstack([np.array(x), np.array(v).reshape(groups.n_groups, -1)])), step(field, x, v, *a)
         )[1]  # fmt: skip
         for n in calls:
-            cache.train(scene, scene.sensors()[0], table, groups, n)
-        seen.append((np.array(points), {k: np.array(v) for k, v in cache.field.weights.parameters().items()}))
+            cache.train(scene, scene.sensors()[0], table, groups, frames=n)
+        seen.append((np.array(points), {k: np.array(v) for k, v in cache.field.averaged.parameters().items()}))
     (points, weights), (known, known_weights) = seen
     np.testing.assert_array_equal(points, known)
     assert len(points) == 9 and not np.array_equal(points[0], points[1])
@@ -172,7 +173,7 @@ def test_number_of_recordings_is_constant_over_thirty_images():
     visibility = integrator.light_sampler.cache
 
     def recordings():
-        return [integrator.cache._frame.n_recordings, visibility._step.n_recordings,
+        return [*integrator.cache.recordings().values(), *visibility.recordings().values(),
                 *(p.n_recordings for p in integrator.film_state.passes.recorded.values())]  # fmt: skip
 
     for k in range(5):

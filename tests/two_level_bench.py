@@ -57,7 +57,7 @@ def fill(integrator, kind: str, trained: dict) -> None:
                 bad = rng.random(v.shape) < 0.01
                 weights[k] = np.where(bad, rng.choice([np.nan, np.inf, -np.inf], v.shape), v).astype(v.dtype)
     field.restore(weights)
-    asked = integrator.cache.asked
+    asked = integrator.cache.queried
     n = dr.width(asked.alpha)
     asked.alpha = mi.Float(trained["alpha"] if kind == "trained" else rng.random(n).astype(np.float32))
     dr.make_opaque(asked.alpha)
@@ -98,7 +98,7 @@ class Bench:
         if key not in self.integrators:
             integrator = two_level(**keys)
             integrator.train(self.scene(name), 60)
-            learned = {"weights": integrator.cache.field.snapshot(), "alpha": np.array(integrator.cache.asked.alpha)}
+            learned = {"weights": integrator.cache.field.snapshot(), "alpha": np.array(integrator.cache.queried.alpha)}
             self.integrators[key] = integrator, learned
         return self.integrators[key]
 

@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from . import encoding
-from .field import TrainedField, own_copy
+from .field import TrainedField
+from .optimizer import own_copy
 
 
 class ArrayField(TrainedField):

@@ -9,7 +9,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .field import Field, own_copy
+from .field import Field
+from .optimizer import own_copy
 from .reliability import Reliability, ReliabilityGrid
 
 BLENDS = ("ema", "fast", "switch", "reliability")

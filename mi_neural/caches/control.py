@@ -101,36 +101,37 @@ class ControlVariate:
 
 
 class ControlCache(IncidentCache):
-    """An incident cache that is asked as a control variate: training also keeps the statistics of its α."""
+    """An incident cache that is queried as a control variate: training also keeps the statistics of its α."""
 
     BLEND, MEASURE = ControlVariate, "alpha"
 
     def __init__(self, training=None, shape=None, seed: int = 0):
         super().__init__(training, shape, seed, blend="control")
-        self._look = dr.freeze(self._look_plain, auto_opaque=False)
 
     def adopt(self, field: Field) -> None:
         """Go on from a field that was trained before, of which no α is known yet."""
         super().adopt(field)
-        self.statistics.pop(self.MEASURE, None)
+        self._measure = None
 
-    def _look_plain(self, scene, sensor, lights, cache, seed):
+    def compare_frame(self, scene, sensor, lights, cache, seed):
         records, _ = trace_records(scene, sensor, cache, self.training, seed, lights)
         dr.eval(records)
         answers = cache.query(cache.encode(records.position, records.normal), records.direction)
         cache.observe(records, records.target, answers, answers)
         return cache.mean_sigma()
 
-    def look(self, scene, sensor, lights, frames: int) -> float:
+    def compare(self, scene, sensor, lights, frames: int) -> float:
         """Gather the statistics of α without training, for a cache that came from elsewhere. Returns the mean α."""
-        look = self._look if self.freezes(sensor) else self._look_plain
+        compare = self.recorded("compare_frame", sensor)
         value = mi.Float(0)
         with dr.suspend_grad():
             for k in range(frames):
                 with undisturbed():
-                    value = look(scene, sensor, lights, self.asked, mi.UInt32(self._seed(0x10000000 + k)))
-        self.statistics[self.MEASURE] = float(value[0])
-        return float(value[0])
+                    seed = mi.UInt32(self.random_seed(0x10000000 + k))
+                    value = compare(scene, sensor, lights, self.queried, seed)
+        self.watch()
+        self._measure = float(value[0])
+        return self._measure
 
 
 def _copies(value):

@@ -9,7 +9,6 @@ blurs what the visibility cache keeps apart.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,10 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render.frozen import can_freeze, undisturbed
 from . import encoding, loss
 from .field import Field, FieldShape
-from .schedule import Ramp, pace
+from .schedule import Ramp
+from .trainer import Trainer, found
 from .voxels import Ages
 
 #: Slope of the output below 0.
@@ -29,6 +28,7 @@ LEAK = 0.01
 TARGET_MAX = 1e4
 #: Albedos below this count as this, so that no target is divided by 0.
 ALBEDO_MIN = 0.05
+
 
 @dataclass(frozen=True)
 class DirectTraining(Ramp):
@@ -51,25 +51,22 @@ def albedo(si, bsdf, active):
     return dr.select(diffuse & dr.all(dr.isfinite(value)), dr.clip(value, ALBEDO_MIN, 1), 1)
 
 
-class DirectCache:
+class DirectCache(Trainer):
     """A field of reflected direct light together with its training.
 
     ``trace(scene, sensor, lights, n, seed)`` gives training points: (position, target, valid), the target being
     reflected direct light over :func:`albedo`.
     """
 
-    def __init__(self, trace: Callable, training: DirectTraining | None = None, seed: int = 0):
-        self.trace, self.training, self.seed = trace, training or DirectTraining(), seed
-        self._frame = dr.freeze(self._frame_plain, auto_opaque=False)
-        self._sensor_freezes: dict[int, bool] = {}
-        self.reset()
+    NAME, SALT = "direct light", 0xD12EC7
+    NAMES = {  # noqa: RUF012
+        "steps": "direct_steps", "loss": "direct_loss", "recoveries": "direct_recoveries",
+        "seconds": "seconds_direct",
+    }  # fmt: skip
 
-    def reset(self) -> None:
-        """Forget all that was learned."""
-        self.field: Field | None = None
-        self.ages: Ages | None = None
-        self.steps = 0
-        self.statistics = {"direct_steps": 0, "direct_loss": math.nan, "seconds_direct": 0.0}
+    def __init__(self, trace: Callable, training: DirectTraining | None = None, seed: int = 0):
+        super().__init__(training or DirectTraining(), seed)
+        self.trace = trace
 
     def query(self, x):
         """Reflected direct light at x of a surface of albedo 1, never negative."""
@@ -78,7 +75,7 @@ class DirectCache:
     def start(self, scene, sensor, lights) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
         with dr.suspend_grad():
-            seed = dr.opaque(mi.UInt32, self._seed(0xFFFFFF))
+            seed = dr.opaque(mi.UInt32, self.random_seed(0xFFFFFF))
             x, y, valid = self.trace(scene, sensor, lights, self.training.n_points, seed)
             dr.eval(x, y, valid)
         valid = np.array(valid)
@@ -95,40 +92,29 @@ class DirectCache:
         self.field, self.ages = Field(low, high, shape, scale=scale, seed=self.seed), Ages(low, high)
         dr.eval(self.field)
 
-    def _frame_plain(self, scene, sensor, lights, field, ages, seed):
+    def frame(self, scene, sensor, lights, field, ages, seed, rate_factor):
         training = self.training
         with dr.suspend_grad():
             x, y, valid = self.trace(scene, sensor, lights, training.n_points, seed)
             y = dr.select(valid, dr.clip(y / field.scale, 0, TARGET_MAX), 0)
             dr.eval(x, y, valid)
-            learning_rate, decay = pace(training, ages, x, valid, 1.0, field)
-            n_valid = dr.maximum(dr.count(valid), 1)
-            field.mean = dr.lerp(dr.sum(loss.luminance(y)) / n_valid, field.mean, decay)
+            learning_rate, decay = self.pace(ages, x, valid, rate_factor, field)
+            n_valid = dr.count(valid)
+            share = dr.rcp(mi.Float(dr.maximum(n_valid, 1)))
+            mean_target = dr.sum(loss.luminance(y)) * share
+            field.mean = dr.lerp(mean_target, field.mean, decay)
             dr.eval(field.mean)
         p = field.predict(x, None)
+        prediction = dr.detach(p)
+        dr.schedule(prediction)
         p = dr.select(p > 0, p, LEAK * p)
         epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
-        errors = dr.select(valid, loss.relative_l2(p, y, epsilon), 0) / n_valid
-        return field.step(errors, learning_rate, decay)
+        errors = dr.select(valid, loss.relative_l2(p, y, epsilon), 0) * share
+        value = field.step(errors, learning_rate, decay)
+        mean_prediction = dr.sum(dr.select(valid, dr.abs(loss.luminance(prediction)), 0)) * share
+        return found(value, ages, mean_target, mean_prediction, n_valid)
 
-    def train(self, scene, sensor, lights, steps: int = 1) -> None:
-        """So many steps, each on fresh points."""
-        t0 = time.perf_counter()
-        if self.field is None:
-            self.start(scene, sensor, lights)
-        if id(sensor) not in self._sensor_freezes:
-            self._sensor_freezes[id(sensor)] = can_freeze(sensor)
-        frame = self._frame if self._sensor_freezes[id(sensor)] else self._frame_plain
-        for _ in range(steps):
-            with undisturbed():
-                value = frame(scene, sensor, lights, self.field, self.ages,
-                              dr.opaque(mi.UInt32, self._seed(self.steps)))  # fmt: skip
-            self.steps += 1
-            self.field.steps = self.steps
-        if steps:
-            self.statistics["direct_loss"] = value[0]
-        self.statistics["direct_steps"] += steps
-        self.statistics["seconds_direct"] += time.perf_counter() - t0
-
-    def _seed(self, step: int) -> int:
-        return int(np.random.SeedSequence((self.seed, 0xD12EC7, step)).generate_state(1)[0])
+    def train_step(self, scene, sensor, lights) -> None:
+        """Trace direct light at fresh points and take one step on it."""
+        seed = dr.opaque(mi.UInt32, self.random_seed(self.steps))
+        self.step(self.recorded("frame", sensor), scene, sensor, lights, self.field, self.ages, seed)

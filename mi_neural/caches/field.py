@@ -9,11 +9,11 @@ import drjit as dr
 import drjit.nn as nn
 import mitsuba as mi
 import numpy as np
-from drjit.opt import Adam
 
 from . import backprop, encoding, files
 from .files import FILE_VERSION, CacheFileError
 from .hash_grid import HashGrid
+from .optimizer import Stride, attach_adam, descend, moments_of, own_copy, set_moments
 
 __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedField", "Weights"]
 
@@ -79,68 +79,6 @@ class FieldShape:
     def n_encoded(self) -> int:
         """Values that :meth:`Field.encode` gives for a position: the first layer's, and the shortcut's three."""
         return self.width + 3
-
-
-def own_copy(value):
-    """An evaluated, detached copy in memory of its own: not shared with another variable or with NumPy (such memory
-    must not be freed while a function is being frozen)."""
-    copy = dr.detach(value) + dr.opaque(mi.Float, 0)
-    dr.eval(copy)
-    return copy
-
-
-def attach_adam(parameters: dict) -> Adam:
-    """An optimiser of copies of `parameters`, by name, that a frozen step can take; β_2 = 0.99: METHODS 1."""
-    optimizer = Adam(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
-    optimizer.update(parameters)
-    # A frozen step is recorded anew when inputs that shared a variable cease to: from the start, share none
-    for key, (value, promoted, lr, (t, *moments)) in optimizer.state.items():
-        value = own_copy(value)
-        dr.enable_grad(value)
-        optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
-    return optimizer
-
-
-def descend(
-    optimizer: Adam, losses, averaged: dict, learning_rate, decay, network_share=1.0
-) -> tuple[dict, mi.Float]:  # fmt: skip
-    """One step of Adam down the gradient of the sum of `losses`, a differentiable array. Returns (the new averaged
-    parameters, the sum).
-
-    All but the hash grid learns at `network_share` of the rate. ``averaged <- decay averaged + (1 - decay) current``. A
-    sum that is not finite changes nothing. May be frozen.
-    """
-    dr.schedule(dr.detach(losses))  # summed beforehand, they would take a kernel of their own that goes forth
-    dr.backward(losses)
-    loss = dr.sum(dr.detach(losses))
-    ok = dr.isfinite(loss)
-    # A copy for each parameter: Dr.Jit 1.5.0 multiplies a learning rate that is an array in place
-    optimizer.set_learning_rate({k: mi.Float(learning_rate) * (1 if k == "grid" else network_share) for k in optimizer})
-    optimizer.step(eval=False, active=ok)
-    optimizer.set_learning_rate({k: None for k in optimizer})
-    decay = dr.select(ok, decay, 1)
-    averaged = {k: dr.lerp(dr.detach(optimizer[k]), v, decay) for k, v in averaged.items()}
-    dr.eval(optimizer, averaged)
-    return averaged, loss
-
-
-def moments_of(optimizer: Adam) -> dict[str, np.ndarray]:
-    """What an optimiser of :func:`attach_adam` remembers of the steps so far, by names made of its parameters'."""
-    arrays = {}
-    for key, (_, _, _, (t, first, second, _)) in optimizer.state.items():
-        arrays |= {f"adam_steps.{key}": np.array(t), f"first.{key}": np.array(first), f"second.{key}": np.array(second)}
-    return arrays
-
-
-def set_moments(optimizer: Adam, arrays: dict[str, np.ndarray]) -> None:
-    """Go on from :func:`moments_of`. Raises ``KeyError`` or ``ValueError`` where something is missing or too long."""
-    for key, (value, promoted, lr, (t, *moments, largest)) in optimizer.state.items():
-        given = [arrays[f"{name}.{key}"] for name in ("first", "second")]
-        steps = int(arrays[f"adam_steps.{key}"].item())
-        if steps < 0 or any(a.shape != m.shape for a, m in zip(given, moments, strict=True)):
-            raise ValueError(f"the optimiser's moments of {key} do not have the size of its parameters")
-        taken = [own_copy(type(m)(np.float32(a))) for a, m in zip(given, moments, strict=True)]
-        optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), steps), *taken, largest)
 
 
 def _split(mlp, n_first: int) -> dict[str, np.ndarray]:
@@ -447,7 +385,7 @@ class Field(TrainedField):
     GAIN = 8.0
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object,
-        "scale": object, "mean": object, "network_share": object,
+        "scale": object, "mean": object, "stride": object,
     }  # fmt: skip
 
     def __init__(self, box_min, box_max, shape: FieldShape | None = None, *, scale: float = 1.0, seed: int = 0):
@@ -469,10 +407,10 @@ class Field(TrainedField):
         self.current = self.WEIGHTS(self.shape, self.seed)
         self.averaged = self.WEIGHTS(self.shape, self.seed)
         self.mean = mi.Float(1.0)  # running mean of the targets over `scale`
-        self.network_share = mi.Float(1)
+        self.stride = Stride.make()
         self._attach_optimizer()
         self.steps = 0
-        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean, self.network_share)
+        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.mean)
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -528,10 +466,11 @@ class Field(TrainedField):
         Returns the sum.
 
         ``averaged <- decay averaged + (1 - decay) current``: with a `decay` that grows from 0, as the integrators give
-        it, the average is free of bias from its start. A sum that is not finite changes nothing. May be frozen.
+        it, the average is free of bias from its start. What diverges changes nothing and returns NaN, see
+        :func:`~mi_neural.caches.optimizer.descend`. May be frozen.
         """
         average, loss = descend(
-            self.optimizer, losses, self.averaged.parameters(), learning_rate, decay, self.network_share
+            self.optimizer, losses, self.averaged.parameters(), learning_rate, decay, self.stride
         )
         self.averaged.assign(average)
         self.averaged.pack()

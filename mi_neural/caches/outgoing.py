@@ -22,11 +22,13 @@ from ..render.sampling import PathSampler
 from ..render.surface import scene_is_glossy, surface_of
 from . import encoding, loss
 from .blend import OutgoingBlend
-from .field import FieldShape, TrainedField, Weights, descend, shortcut
+from .field import FieldShape, TrainedField, Weights, shortcut
 from .incident import SCALE_TRIM, IncidentCache, Training
+from .optimizer import Stride, descend
 from .places import N_PLACES, Places
 from .records import packed
 from .reliability import Reliability
+from .trainer import found
 from .training_paths import CONTENTS, Suffixes, trace_training_paths
 from .voxels import Ages, Voxels, check_box
 
@@ -120,7 +122,7 @@ class OutgoingField(TrainedField):
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "scale": object,
         "eta": object, "density": object, "places": object, "voxels": object,
-        "network_share": object,
+        "stride": object,
     }  # fmt: skip
 
     def __init__(
@@ -144,13 +146,12 @@ class OutgoingField(TrainedField):
         self.averaged = Weights(self.shape, self.seed)
         self._attach_optimizer()
         self.scale = mi.Float(self.given_scale or 0.0)
-        self.network_share = mi.Float(1)
+        self.stride = Stride.make()
         self.eta = mi.Float(0.0)  # 1 - a^t: the share of the average that training has filled
         self.density = dr.zeros(mi.Float, DENSITY_ENTRIES)  # mean training records of a step in each cell
         self.places = Places(N_PLACES)
         self.steps = 0
-        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places,
-                       self.network_share)  # fmt: skip
+        dr.make_opaque(self.box_min, self.box_inv_extent, self.scale, self.eta, self.density, self.places)
 
     # -------------------------------------------------------------------------------------------------------------
     # Query
@@ -239,23 +240,23 @@ class OutgoingField(TrainedField):
             dr.eval(usable, n_bad, x, n, w, albedo, roughness, y, share, able, scale, mean_target)
 
         p = self.predict(x, n, w, albedo, roughness)
-        said = dr.detach(p)
-        dr.schedule(said)
+        prediction = dr.detach(p)
+        dr.schedule(prediction)
         if watch is not None:
             with dr.suspend_grad():
-                watch(y * scale, dr.maximum(said, 0) * scale, usable)
+                watch(y * scale, dr.maximum(prediction, 0) * scale, usable)
         errors = dr.select(usable, loss.relative_l2(p, y, epsilon), 0) * share
         errors = dr.select(able, errors, math.nan)
         eta = smoothing * self.eta + (1 - smoothing)
         decay = dr.select(smoothing < 1, smoothing * self.eta / dr.maximum(eta, 1e-30), 1)
         averaged, error = descend(
-            self.optimizer, errors, self.averaged.parameters(), learning_rate, decay, self.network_share
+            self.optimizer, errors, self.averaged.parameters(), learning_rate, decay, self.stride
         )
         self.averaged.assign(averaged)
         self.averaged.pack()
         learned = dr.isfinite(error)
         moves = learned & (smoothing < 1)
-        mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(said)), 0)) * share
+        mean_prediction = dr.sum(dr.select(usable, dr.abs(loss.luminance(prediction)), 0)) * share
         self.eta = dr.select(moves, eta, self.eta)
         self.scale = dr.select(moves, scale, self.scale)
         dr.eval(self.averaged, self.eta, self.scale)
@@ -430,14 +431,14 @@ class OutgoingCache(IncidentCache):
             training or OutgoingTraining(), shape or OutgoingShape(), seed, blend=blend, reliability=reliability
         )
 
-    def _probe_plain(self, scene, sensor, lights, seed):
+    def probe(self, scene, sensor, lights, seed):
         records, _ = trace_outgoing(scene, sensor, None, self.training, seed, lights, False)
         target = records.target / reflectance(records.surface.albedo)
         return records.surface.position, loss.luminance(target), records.valid
 
-    def _frame_plain(self, scene, sensor, lights, asked, ages, seed, rate_factor):
-        blend = asked if isinstance(asked, OutgoingBlend) else None
-        field = blend.field if blend else asked
+    def frame(self, scene, sensor, lights, cache, ages, seed, rate_factor):
+        blend = cache if isinstance(cache, OutgoingBlend) else None
+        field = blend.field if blend else cache
         with dr.suspend_grad():
             records, n_bad = trace_outgoing(scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene))
             n_valid = dr.count(records.valid)
@@ -461,7 +462,7 @@ class OutgoingCache(IncidentCache):
             with dr.suspend_grad():
                 blend.refresh()
                 sigma = blend.mean_sigma()
-        return value, mean_target, mean_prediction, n_valid, n_bad + more, sigma
+        return found(value, ages, mean_target, mean_prediction, n_valid, n_bad + more, sigma)
 
     def note(self, field: OutgoingField, records, seed, decay) -> None:
         """Keep where the records of a step lie."""
@@ -473,8 +474,9 @@ class OutgoingCache(IncidentCache):
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
         with dr.suspend_grad(), undisturbed():
-            probe = self._probe if self.freezes(sensor) else self._probe_plain
-            points, target, valid = (np.array(v) for v in probe(scene, sensor, lights, mi.UInt32(self._seed(0xFFFFFF))))
+            probe = self.recorded("probe", sensor)
+            seed = mi.UInt32(self.random_seed(0xFFFFFF))
+            points, target, valid = (np.array(v) for v in probe(scene, sensor, lights, seed))
         box = scene.bbox()
         whole = np.array(box.min).ravel(), np.array(box.max).ravel()
         low, high = encoding.record_box(points.T[valid], *whole)

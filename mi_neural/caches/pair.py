@@ -16,6 +16,7 @@ from .accuracy import Accuracy, Pairs
 from .field import Field, FieldShape, TrainedField
 from .incident import Training, learn, reflect
 from .outgoing import OutgoingCache, OutgoingField, OutgoingShape, OutgoingTraining, fitted, training_paths
+from .trainer import found
 from .training_paths import PathRecords
 
 
@@ -144,7 +145,7 @@ class PairCache(OutgoingCache):
         self.field = PairField(outgoing, incident, Accuracy(*outgoing.box, scale=scale))
         dr.eval(self.field)
 
-    def _frame_plain(self, scene, sensor, lights, field, ages, seed, rate_factor):
+    def frame(self, scene, sensor, lights, field, ages, seed, rate_factor):
         outgoing, incident = field.outgoing, field.incident
 
         def ask(si, bsdf, active, sampler):
@@ -175,8 +176,9 @@ class PairCache(OutgoingCache):
             incident, arrived, self.incident_training, seed + 0x3C6EF372, own_rate, decay
         )
         value = dr.select(n_valid > 0, value + value_i, 0)  # nothing to learn is no divergence
+        mean_target = dr.maximum(mean_target, mean_target_i)
         mean_prediction = dr.maximum(mean_prediction, mean_prediction_i)
-        return value, dr.maximum(mean_target, mean_target_i), mean_prediction, n_valid, n_bad + more, mi.Float(0)
+        return found(value, ages, mean_target, mean_prediction, n_valid, n_bad + more)
 
 
 def pairs_of(traced: PathRecords, outgoing: OutgoingField, n_paths: int) -> Pairs:

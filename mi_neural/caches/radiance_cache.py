@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..render.frozen import undisturbed
-from .field import CacheFileError, own_copy
+from .field import CacheFileError
+from .optimizer import own_copy
 from .outgoing import OutgoingField, OutgoingShape
 from .voxels import check_box
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .optimizer import LATER, LONGEST, LONGEST_LATER
 from .voxels import Ages
 
 
@@ -49,15 +50,16 @@ class Ramp:
 def pace(training, ages: Ages, x, valid, rate_factor, *fields) -> tuple:
     """(learning rate, decay of the average) for records at x, by how long their places have been trained; 1-wide.
 
-    `training` gives ``rate(step)`` and ``decay(step)``. Networks of `fields` learn at a share of that rate: places that
-    are out of view need them as they are, and new ones are learned by the entries of the grid. May be frozen.
+    `training` gives ``rate(step)`` and ``decay(step)``. Networks of `fields` learn at a share of that rate, which their
+    `stride` is told: places that are out of view need them as they are, and new ones are learned by the entries of the
+    grid. It is told how long a step may be, too. May be frozen.
     """
     age = ages.age(x, valid)
     learning_rate, decay = mi.Float(training.rate(age) * rate_factor), mi.Float(training.decay(age))
-    share = dr.square(1 - ages.novelty)
-    dr.eval(learning_rate, decay, share)
+    share, longest = dr.square(1 - ages.novelty), dr.select(ages.total <= LATER, mi.Float(LONGEST), LONGEST_LATER)
+    dr.eval(learning_rate, decay, share, longest)
     for field in fields:
-        if hasattr(field, "network_share"):
-            field.network_share = share + 0  # not the same variable twice
-            dr.eval(field.network_share)
+        if hasattr(field, "stride"):
+            field.stride.network_share, field.stride.longest = share + 0, longest + 0  # not the same variables twice
+            dr.eval(field.stride)
     return learning_rate, decay

@@ -18,8 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from . import encoding, loss
-from .field import TrainedField, own_copy
+from .field import TrainedField
 from .incident import TARGET_MAX, IncidentCache
+from .optimizer import own_copy
 
 #: Means reach back this many times as far as averaged weights do: they have no other way to be rid of noise.
 MEMORY = 6.0

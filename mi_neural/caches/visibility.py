@@ -6,9 +6,8 @@ with one output per light, learned from shadow rays while rendering. It depends 
 
 from __future__ import annotations
 
-import math
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -17,9 +16,10 @@ import numpy as np
 from ..render.frozen import undisturbed
 from ..render.sampling import PathSampler
 from . import encoding
-from .divergence import StepWatch, healthy
-from .field import FieldShape, Weights, attach_adam, descend, own_copy
-from .schedule import Ramp, pace
+from .field import FieldShape, TrainedField, Weights
+from .optimizer import Stride, descend
+from .schedule import Ramp
+from .trainer import Trainer, found
 from .voxels import Ages
 
 #: Steps whose points are found in one go, where there are so many to do.
@@ -38,14 +38,15 @@ class VisibilityTraining(Ramp):
     last_rate: float = 0.001
 
 
-class VisibilityField:
+class VisibilityField(TrainedField):
     """``V(x)`` in [0, 1] for `shape.n_outputs` lights or clusters. A PyTree.
 
     ``query(x)`` gives a list of Dr.Jit floats. An untrained field says about 1/2 for all.
     """
 
+    KIND, WEIGHTS = "visibility", Weights
     DRJIT_STRUCT = {  # noqa: RUF012
-        "weights": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "network_share": object,
+        "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "stride": object,
     }  # fmt: skip
 
     def __init__(self, box_min, box_max, shape: FieldShape, seed: int = 0):
@@ -58,51 +59,42 @@ class VisibilityField:
 
     def reset(self) -> None:
         """The weights as they were when the field was made."""
-        self.network_share = mi.Float(1)
-        self.weights = Weights(self.shape, self.seed)
-        self.optimizer = attach_adam(self.weights.parameters())
-        self.weights.assign({k: own_copy(v) for k, v in self.weights.parameters().items()})
-        self.weights.pack()
-        dr.make_opaque(self.box_min, self.box_inv_extent, self.network_share)
-        dr.eval(self.optimizer, self.weights)
-
-    def snapshot(self) -> tuple[dict, dict]:
-        """Weights being trained and averaged ones, as NumPy arrays by name."""
-        trained = {k: np.array(dr.detach(v)) for k, v in self.optimizer.items()}
-        return trained, {k: np.array(dr.detach(v)) for k, v in self.weights.parameters().items()}
-
-    def restore(self, kept: tuple[dict, dict]) -> None:
-        """Go back to a :meth:`snapshot`; the optimiser's moments start anew."""
-        trained, averaged = kept
-        known = self.weights.parameters()
-        self.optimizer = attach_adam({k: own_copy(type(v)(trained[k])) for k, v in known.items()})
-        self.weights.assign({k: own_copy(type(v)(averaged[k])) for k, v in known.items()})
-        self.weights.pack()
-        dr.eval(self.optimizer, self.weights)
+        self.current, self.averaged = Weights(self.shape, self.seed), Weights(self.shape, self.seed)
+        self.stride, self.steps = Stride.make(), 0
+        self._attach_optimizer()
+        dr.make_opaque(self.box_min, self.box_inv_extent)
 
     def query(self, x) -> list:
         """Predicted visibility of every light from x."""
-        return [_sigmoid(v) for v in self.weights(self._encode(x))]
+        return [_sigmoid(v) for v in self.averaged(self._encode(self.averaged, x))]
 
-    def _encode(self, x) -> list:
-        return list(self.weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
+    def _encode(self, weights: Weights, x) -> list:
+        return list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
     def step(self, x, visible, learning_rate, decay):
         """One step of Adam on ``mean (V(x) - visible)²``; `visible` is a tensor (n_outputs, points). Returns the loss.
 
         Queries use ``averaged <- decay averaged + (1 - decay) trained``.
         """
-        averaged = self.weights.parameters()
-        self.weights.assign(self.optimizer)
-        out, n = self.weights.differentiable(self._encode(x)), dr.width(x)
+        weights, n = self.trainable(), dr.width(x)
+        out = weights.differentiable(self._encode(weights, x))
         lane = dr.arange(mi.UInt32, n)
         errors = [dr.square(_sigmoid(v) - dr.gather(mi.Float, visible.array, lane + k * n)) for k, v in enumerate(out)]
         losses = sum(errors[1:], errors[0]) * (1 / (n * len(out)))
-        averaged, loss = descend(self.optimizer, losses, averaged, learning_rate, decay, self.network_share)
-        self.weights.assign(averaged)
-        self.weights.pack()
-        dr.eval(self.weights)
+        averaged, loss = descend(
+            self.optimizer, losses, self.averaged.parameters(), learning_rate, decay, self.stride
+        )
+        self.averaged.assign(averaged)
+        self.averaged.pack()
+        dr.eval(self.averaged)
         return loss
+
+    def constants(self) -> dict:
+        return {"shape": asdict(self.shape), "box": self.box, "seed": self.seed}
+
+    @classmethod
+    def make(cls, constants: dict) -> VisibilityField:
+        return cls(*constants["box"], FieldShape(**constants["shape"]), constants["seed"])
 
 
 def _sigmoid(v):
@@ -169,35 +161,23 @@ def surface_point(scene, ray, active):
     return p + away * n, n, active
 
 
-class VisibilityCache:
+class VisibilityCache(Trainer):
     """A field of visibilities together with its training.
 
-    `groups` is a :class:`~mi_neural.lights.clusters.Groups`: what the outputs stand for. A step that diverges is
-    undone, and the learning rate halved; `statistics` counts such recoveries.
+    `groups` is a :class:`~mi_neural.lights.clusters.Groups`: what the outputs stand for.
     """
 
-    #: Steps between snapshots that a divergence is undone with.
-    SNAPSHOT_EVERY = 64
+    NAME, SALT = "visibility", 0x7151B1E
+    NAMES = {  # noqa: RUF012
+        "steps": "visibility_steps", "loss": "visibility_loss", "recoveries": "visibility_recoveries",
+        "seconds": "seconds_visibility",
+    }  # fmt: skip
 
     def __init__(self, training: VisibilityTraining | None = None, shape: FieldShape | None = None, seed: int = 0):
-        self.training, self.seed = training or VisibilityTraining(), seed
+        super().__init__(training or VisibilityTraining(), seed)
         self.shape = shape
-        self._step = dr.freeze(self._step_plain, auto_opaque=False)
-        self.reset()
 
-    def reset(self) -> None:
-        """Forget all that was learned."""
-        self.field: VisibilityField | None = None
-        self.ages: Ages | None = None
-        self.steps = 0
-        self.rate_factor = 1.0
-        self._good: tuple[dict, dict] | None = None
-        self._step_watch = StepWatch()
-        self.statistics = {
-            "visibility_steps": 0, "visibility_loss": math.nan, "visibility_recoveries": 0, "seconds_visibility": 0.0,
-        }  # fmt: skip
-
-    def start(self, scene, sensor, n_outputs: int) -> None:
+    def start(self, scene, sensor, table, groups) -> None:
         """Make the field in the box of what the camera sees."""
         box = scene.bbox()
         with dr.suspend_grad():
@@ -213,7 +193,7 @@ class VisibilityCache:
         low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
         shape = self.shape or FieldShape(
             n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
-            width=32, n_hidden=2, n_outputs=n_outputs, leak=0.01,
+            width=32, n_hidden=2, n_outputs=groups.n_groups, leak=0.01,
         )  # fmt: skip
         # Large cells: points in the air are few
         self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high, resolution=2)
@@ -241,54 +221,34 @@ class VisibilityCache:
             dr.eval(visible)
         return x, visible
 
-    def _step_plain(self, field, x, visible, ages, rate_factor):
+    def frame(self, field, x, visible, ages, rate_factor):
         with dr.suspend_grad():
-            learning_rate, decay = pace(self.training, ages, x, mi.Bool(True), rate_factor, field)
+            learning_rate, decay = self.pace(ages, x, mi.Bool(True), rate_factor, field)
         visible = mi.TensorXf(visible, shape=(field.shape.n_outputs, dr.width(x)))
-        return field.step(x, visible, learning_rate, decay)
+        return found(field.step(x, visible, learning_rate, decay), ages)
 
-    def train(self, scene, sensor, table, groups, steps: int = 1) -> None:
+    def train_step(self, scene, sensor, table, groups, batch: int = 1) -> None:
+        """So many steps, each on fresh points, which are found together."""
+        seeds = mi.UInt32([self.random_seed(self.steps + k) for k in range(batch)])
+        dr.make_opaque(seeds)
+        with undisturbed():
+            points = self._records(scene, sensor, table, groups, seeds)
+        for k in range(batch):
+            self.step(self.recorded("frame"), self.field, *_part(points, k, batch), self.ages)
+
+    def train(self, scene, sensor, table, groups, *, frames: int = 1) -> None:
         """So many steps, each on fresh points."""
+        t0, done = time.perf_counter(), 0
+        self.watch()
         if self.field is None:
-            self.start(scene, sensor, groups.n_groups)
-        if self._good is None:
-            self._good = self.field.snapshot()
-        t0 = time.perf_counter()
-        done = 0
-        while done < steps:
-            n_steps = BATCH if steps - done >= BATCH else 1
-            numbers = range(self.steps, self.steps + n_steps)
-            seeds = [int(np.random.SeedSequence((self.seed, 0x7151B1E, k)).generate_state(1)[0]) for k in numbers]
-            seeds = mi.UInt32(seeds)
-            dr.make_opaque(seeds)
-            with undisturbed():
-                points = self._records(scene, sensor, table, groups, seeds)
-                for k in range(n_steps):
-                    self._step_watch.begin(self.field.optimizer)
-                    loss = self._step(
-                        self.field, *_part(points, k, n_steps), self.ages, dr.opaque(mi.Float, self.rate_factor)
-                    )
-                    self.steps += 1
-                    self._watch(loss[0])
-            done += n_steps
-        if steps:
-            self.statistics["visibility_loss"] = loss[0]
-        self.statistics["visibility_steps"] += steps
-        self.statistics["seconds_visibility"] += time.perf_counter() - t0
-
-    def _watch(self, loss: float) -> None:
-        """Undo a step that diverged: go back to the last good weights, with half the learning rate."""
-        if math.isfinite(loss) and healthy(self._step_watch.step(self.field.optimizer), self.steps):
-            if self.steps % self.SNAPSHOT_EVERY == 0:
-                self._good = self.field.snapshot()
-            return
-        self.field.restore(self._good)
-        self.rate_factor *= 0.5
-        self.statistics["visibility_recoveries"] += 1
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"mi_neural: visibility diverged at step {self.steps}; last good weights restored, learning rate halved",
-        )
+            self.start(scene, sensor, table, groups)
+        while done < frames:
+            batch = BATCH if frames - done >= BATCH else 1
+            self.train_step(scene, sensor, table, groups, batch)
+            done += batch
+            if frames > 1:  # a single step is not waited for: the next call reads what it found
+                self.watch()
+        self._counts["seconds"] += time.perf_counter() - t0
 
 
 def _part(arrays, k: int, n: int) -> list:

@@ -146,9 +146,11 @@ class Ages:
         dr.eval(self.first, self.total, self.novelty, self.steps, self.recent, self.usual, mean)
         return dr.select(mean > 0, HALF_KNOWN * (dr.rcp(dr.maximum(mean, 1e-6)) - 1), 0)
 
-    def novel(self) -> bool:
-        """Whether the camera has come to places that are new to a cache that is not."""
-        return float(self.total[0]) >= self.OLD and float(self.novelty[0]) > self.NOVEL
+    @classmethod
+    def is_novel(cls, total: float, novelty: float) -> bool:
+        """Whether the camera has come to places that are new to a cache that is not, by such values of `total` and
+        `novelty`."""
+        return total >= cls.OLD and novelty > cls.NOVEL
 
     def left(self, distance) -> tuple:
         """The places that have left the view, for :func:`~mi_neural.caches.training_paths.first_rays`, to be looked at
