@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mi_neural import parameters, plan
 from mi_neural.lights.table import LightTable
-from mi_neural.render.binding import SceneWatch
+from mi_neural.render.binding import BoundScene
 
 
 class LightSampler(mi.Emitter):
@@ -21,8 +21,8 @@ class LightSampler(mi.Emitter):
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
-        self.scene = SceneWatch()
-        self.edits: parameters.Watch | None = None  # of the lights' parameters; None: there is nothing to choose
+        self.scene = BoundScene()
+        self.edits: parameters.Edits | None = None  # of the lights' parameters; None: there is nothing to choose
         self.sampler = None
         self.plan_mode = props.get("plan", "scene")
         self._check(self.plan_mode in plan.MODES,
@@ -73,7 +73,7 @@ class LightSampler(mi.Emitter):
             self.reset()
             self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
-            self.edits = _watch(scene) if self.plan.modelled("light_sampler") else None
+            self.edits = _edits_of(scene) if self.plan.modelled("light_sampler") else None
         if self.edits is None:
             return None
         with dr.suspend_grad():
@@ -117,7 +117,7 @@ class LightSampler(mi.Emitter):
         return dr.zeros(mi.Wavelength), mi.Spectrum(0)
 
 
-def _watch(scene) -> parameters.Watch:
+def _edits_of(scene) -> parameters.Edits:
     """Of the parameters that the table is made of."""
     pairs = []
     for emitter in scene.emitters():
@@ -125,4 +125,4 @@ def _watch(scene) -> parameters.Watch:
         params = parameters.traverse(shape if shape is not None else emitter)
         pairs += [(params, key) for key in params.keys()
                   if not key.startswith("bsdf.") and not key.endswith("sampling_weight")]  # fmt: skip
-    return parameters.Watch(pairs)
+    return parameters.Edits(pairs)

@@ -21,13 +21,13 @@ def check_scene(scene, plugin: str) -> None:
     for sensor in scene.sensors():
         if sensor.get_medium() is not None:
             raise ValueError(
-                f"{plugin}: the camera is inside a participating medium, which the cache does not model; "
+                f"{plugin}: the camera is inside a participating medium, and media are not modelled; "
                 'use <integrator type="volpath"/>'
             )
     for shape in scene.shapes():
         if shape.is_medium_transition():
             raise ValueError(
-                f"{plugin}: shape '{shape.id()}' borders a participating medium, which the cache does not model; "
+                f"{plugin}: shape '{shape.id()}' borders a participating medium, and media are not modelled; "
                 'use <integrator type="volpath"/>'
             )
     for emitter in scene.emitters():

@@ -21,7 +21,7 @@ from mi_neural.integrators import planning
 from mi_neural.integrators.base import FilmIntegrator, refuse_gradients
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.lighting import light_sampler_of
-from mi_neural.render.binding import SceneWatch
+from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
 from mi_neural.render.frozen import undisturbed
 from mi_neural.render.sampling import PathSampler
@@ -62,9 +62,9 @@ class _State:
 
     def __init__(self):
         self.ns_per_query = math.nan
-        self.facts: dict = {}  # what was measured of the scene
+        self.measured: dict = {}  # of the scene
         self.plan: plan.ScenePlan | None = None  # of the scene that was rendered last
-        self.watch = SceneWatch()
+        self.bound = BoundScene()
         self.reset()
 
     def reset(self) -> None:
@@ -141,8 +141,8 @@ class CacheIntegrator(FilmIntegrator):
         """The learning rate where no key says it."""
         return Training.learning_rate
 
-    def settle(self, scene, sensor) -> None:
-        """Measure, once per scene, what settings depend on; results go to ``state.facts``."""
+    def measure_scene(self, scene, sensor) -> None:
+        """Measure, once per scene, what settings depend on; results go to ``state.measured``."""
 
     @property
     def needs_cache(self) -> bool:
@@ -157,13 +157,13 @@ class CacheIntegrator(FilmIntegrator):
     def follow(self, other: CacheIntegrator, scene, sensor) -> None:
         """Render with what `other` has bound, whose cache this integrator was given, and train nothing."""
         self.state.lights = other.bound_lights
-        if not self.state.facts:
-            self.settle(scene, self._view(sensor))
+        if not self.state.measured:
+            self.measure_scene(scene, self._view(sensor))
 
     def forget_scene(self) -> None:
         """Forget what was measured of the scene that was bound, and what was recorded for it."""
         self.film_state.forget_scene()
-        self.state.facts = {}
+        self.state.measured = {}
 
     @property
     def bound_lights(self):
@@ -199,31 +199,31 @@ class CacheIntegrator(FilmIntegrator):
     def bind(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
         view = self._view(sensor)
-        known = self.state.watch.parts
-        if self.state.watch.changed(scene) or self.state.signature is None:
+        known = self.state.bound.parts
+        if self.state.bound.changed(scene) or self.state.signature is None:
             try:
-                self._begin(scene, known is not self.state.watch.parts)
-                if self.state.plan is None or known is not self.state.watch.parts:
+                self._begin(scene, known is not self.state.bound.parts)
+                if self.state.plan is None or known is not self.state.bound.parts:
                     planning.follow(self, planning.make_plan(self, scene, view))
             except ValueError:
-                self.state.watch.parts = known
+                self.state.bound.parts = known
                 raise
         if self.light_sampler is not None:
             # Settings are measured with lights chosen as they will be; an image rendered in several calls is one frame
-            learn = (train and not self.state.image_open) or not self.state.facts
+            learn = (train and not self.state.image_open) or not self.state.measured
             with dr.suspend_grad():
                 self.state.lights = self.light_sampler.lights(scene, view, train=learn)
         self.cache.recordable = self.film_state.scene_records(scene)
         if not self.needs_cache:
-            if not self.state.facts:
-                self.settle(scene, view)
+            if not self.state.measured:
+                self.measure_scene(scene, view)
             return
         with dr.resume_grad():
             if self.cache.field is None:
                 self.cache.start(scene, view, self.state.lights)
-            if not self.state.facts:
+            if not self.state.measured:
                 with dr.suspend_grad():
-                    self.settle(scene, view)
+                    self.measure_scene(scene, view)
             if train and not self.freeze_cache and not self.state.image_open:
                 if self.state.images == 0 and self.cache.steps == 0:
                     self._train_first(scene, view)
@@ -347,7 +347,7 @@ class CacheIntegrator(FilmIntegrator):
         s.update(film)
         s["queries"] = int(self.state.queries)
         s["images"] = self.state.images
-        s.update(self.state.facts)
+        s.update(self.state.measured)
         s.update(self.cache.measured())
         if self.light_sampler is not None:
             s.update(self.light_sampler.statistics())

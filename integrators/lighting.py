@@ -8,7 +8,7 @@ import mitsuba as mi
 from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.planning import exact_sampler
-from mi_neural.render.binding import SceneWatch
+from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
 from mi_neural.render.frozen import LOCK
 
@@ -38,7 +38,7 @@ class LightSamplingIntegrator(FilmIntegrator):
         super().__init__(props)
         self.light_sampler = self.nested_sampler = light_sampler_of(props)
         self.lights = None
-        self.bound = SceneWatch()
+        self.bound = BoundScene()
 
     @property
     def bound_lights(self):

@@ -115,10 +115,10 @@ class NIRCIntegrator(CacheIntegrator):
 
     @property
     def n_light(self) -> int:
-        """Emitter and traced BSDF samples per camera sample: as set, or as :meth:`settle` found."""
-        return self.light_samples if self.light_samples > 0 else self.state.facts.get("light_samples", 1)
+        """Emitter and traced BSDF samples per camera sample: as set, or as :meth:`measure_scene` found."""
+        return self.light_samples if self.light_samples > 0 else self.state.measured.get("light_samples", 1)
 
-    def settle(self, scene, sensor) -> None:
+    def measure_scene(self, scene, sensor) -> None:
         """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene."""
         if self.light_samples > 0:
             return
@@ -145,7 +145,7 @@ class NIRCIntegrator(CacheIntegrator):
             level += float(self.cache.field.scale[0])
         noise = np.sort(variance / (np.array(mean) ** 2 + 0.25 * level**2 + 1e-30))[: int(0.999 * n)].mean()
         chosen = plan.light_samples(float(noise))
-        self.state.facts |= {"direct_noise": float(noise), "light_samples": chosen.value}
+        self.state.measured |= {"direct_noise": float(noise), "light_samples": chosen.value}
         if self.state.plan is not None:
             self.state.plan.decisions["light_samples"] = chosen
 

@@ -17,7 +17,7 @@ from mi_neural.lights.table import LightTable
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.binding import SceneWatch
+from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
 from mi_neural.render.sampling import PathSampler
 
@@ -156,7 +156,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         """Forget what was learned; the next image trains anew."""
         self.light_sampler.reset()
         self.cache.reset()
-        self.bound = SceneWatch()
+        self.bound = BoundScene()
         self.lights = None  # what chooses lights; None: the scene itself
         self.unshadowed: UnshadowedLights | None = None
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns

@@ -175,7 +175,7 @@ class Mixed:
         for _ in range(n_unbiased):
             yield size, True
 
-    def _settle(self, scene, sensor) -> None:
+    def _measure_scene(self, scene, sensor) -> None:
         """The biased part's lights, and its number of light samples for the unbiased part, too: splitting there pays
         where direct light is noisy (Sponza 1.3, staircase 1.2, Cornell box 1.2 times less variance in equal time)."""
         self.nirc.follow(self.integrator, scene, sensor)
@@ -184,7 +184,7 @@ class Mixed:
     def add(self, scene, sensor, seed: int, spp: int, render) -> None:
         """Take `spp` more samples a pixel; ``render(seed, spp)`` gives a block of unbiased ones."""
         nirc = self.nirc
-        self._settle(scene, sensor)
+        self._measure_scene(scene, sensor)
         if not self.planned:
             self.begin()
             nirc.plan_samples(spp)
@@ -208,7 +208,7 @@ class Mixed:
     def compile(self, scene, sensor, seed: int, spp: int, render) -> None:
         """Compile what images of one call or several calls of `spp` samples need; ``render(seed, spp)`` as above."""
         nirc, size = self.nirc, tuple(int(v) for v in sensor.film().crop_size())
-        self._settle(scene, sensor)
+        self._measure_scene(scene, sensor)
         sizes = pieces(spp, max(power_of_four(spp / BLOCKS), 1)) + pieces(spp, power_of_four(spp))
         for n in sorted(set(sizes)):
             key = id(scene), id(sensor), size, n

@@ -31,7 +31,7 @@ def read(params, key: str):
         return None
 
 
-class Watch:
+class Edits:
     """Says when a value of any of these parameters, pairs of (``mi.traverse(node)``, key), has become another.
 
     An array is the same as long as its variables have the same numbers. A copy keeps them alive, so that their numbers

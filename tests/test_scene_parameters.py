@@ -216,7 +216,7 @@ def test_values_that_cannot_be_handed_over_are_left_out(fails):
 def test_edits_are_noticed_whatever_else_a_light_has():
     scene = ball({"type": "diffuse"}, lantern={"type": "odd_lantern"}, spark={"type": "point", "position": [1, 2, 3]})
     lights = [parameters.traverse(emitter) for emitter in scene.emitters()]
-    edits = parameters.Watch([(params, key) for params in lights for key in params.keys()])
+    edits = parameters.Edits([(params, key) for params in lights for key in params.keys()])
     assert [edits.changed() for _ in range(3)] == [True, False, False]
     spark = next(params for params in lights if "position" in params)
     spark["position"] = mi.Point3f(1, 2, 4)
@@ -230,7 +230,7 @@ def test_edits_are_noticed_whatever_else_a_light_has():
 def test_the_smallest_step_of_a_shape_is_noticed():
     scene = ball({"type": "diffuse"})
     params = parameters.traverse(scene.shapes()[0])
-    edits = parameters.Watch([(params, "to_world")])
+    edits = parameters.Edits([(params, "to_world")])
     assert [edits.changed() for _ in range(2)] == [True, False]
     params["to_world"] = params["to_world"] @ mi.Transform4f().translate([1e-7, 0, 0])
     params.update()

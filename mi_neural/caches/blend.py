@@ -124,10 +124,10 @@ class OutgoingBlend(Blend):
             self.grid.update(x, n, valid, y, current, averaged)
 
 
-def sigma_channels(asked, x, n) -> dict:
+def sigma_channels(cache, x, n) -> dict:
     """Channels that show which predictor answers at points with unit normals: ``sigma``, its weight, and
-    ``preference``, 1 where that exceeds 1/2; both 0 where what is `asked` is no blend."""
-    sigma = asked.sigma(x, n) if isinstance(asked, Blend) else mi.Float(0)
+    ``preference``, 1 where that exceeds 1/2; both 0 where `cache` is no blend."""
+    sigma = cache.sigma(x, n) if isinstance(cache, Blend) else mi.Float(0)
     return {"sigma": sigma, "preference": dr.select(sigma > 0.5, mi.Float(1), 0)}
 
 

@@ -129,7 +129,7 @@ class ControlCache(IncidentCache):
                 with undisturbed():
                     seed = mi.UInt32(self.random_seed(0x10000000 + k))
                     value = compare(scene, sensor, lights, self.queried, seed)
-        self.watch()
+        self.check()
         self._measure = float(value[0])
         return self._measure
 

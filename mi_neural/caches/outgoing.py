@@ -207,7 +207,7 @@ class OutgoingField(TrainedField):
 
     def learn(
         self, x, n, w, albedo, roughness, target, valid, learning_rate, smoothing, epsilon=EPSILON,
-        watch: Callable | None = None,
+        compare: Callable | None = None,
     ):  # fmt: skip
         """One step of Adam on records of radiance `target`, then the averaged copy. May be frozen.
 
@@ -219,7 +219,7 @@ class OutgoingField(TrainedField):
         targets are not finite are left out; with no record left, or a loss that is not finite, nothing changes
         (but Adam's own count of steps).
 
-        `learning_rate` and `smoothing` are 1-wide Dr.Jit floats. ``watch(y, p, usable)``, if given, is called before
+        `learning_rate` and `smoothing` are 1-wide Dr.Jit floats. ``compare(y, p, usable)``, if given, is called before
         the step with targets and predictions, both over albedo. Returns (loss, mean target, mean |prediction|, number
         of records left out), 1-wide, the first three over `scale`; the loss is NaN where there was nothing to learn.
         """
@@ -242,9 +242,9 @@ class OutgoingField(TrainedField):
         p = self.predict(x, n, w, albedo, roughness)
         prediction = dr.detach(p)
         dr.schedule(prediction)
-        if watch is not None:
+        if compare is not None:
             with dr.suspend_grad():
-                watch(y * scale, dr.maximum(prediction, 0) * scale, usable)
+                compare(y * scale, dr.maximum(prediction, 0) * scale, usable)
         errors = dr.select(usable, loss.relative_l2(p, y, epsilon), 0) * share
         errors = dr.select(able, errors, math.nan)
         eta = smoothing * self.eta + (1 - smoothing)
@@ -446,7 +446,7 @@ class OutgoingCache(IncidentCache):
             learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor, field)
             self.note(field, records, seed, decay)
 
-        def watch(y, current, usable):
+        def compare(y, current, usable):
             surface = records.surface
             averaged = field.query(*surface.inputs()) / reflectance(surface.albedo)
             dr.eval(averaged)
@@ -454,7 +454,7 @@ class OutgoingCache(IncidentCache):
 
         value, mean_target, mean_prediction, more = field.learn(
             *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon,
-            watch if blend else None,
+            compare if blend else None,
         )  # fmt: skip
         value = dr.select(n_valid > 0, value, 0)  # nothing to learn is no divergence
         sigma = mi.Float(0)

@@ -180,10 +180,10 @@ class RadianceCache:
             raise ValueError(f"flags is {flags!r}; combine DispatchFlags, as in DispatchFlags.INFERENCE")
         rate, smoothing = _overrides(flags, learning_rate, weight_smoothing)
         counters = _Counters(sample_counters, flags)
-        points = asked = records = None
+        points = n_queries = records = None
         if DispatchFlags.INFERENCE in flags:
             points = _Buffer("prediction_inputs", prediction_inputs, N_COLUMNS)
-            asked = counters.count(0, "inference", points, self.max_inference_sample_count)
+            n_queries = counters.count(0, "inference", points, self.max_inference_sample_count)
         if DispatchFlags.TRAINING in flags:
             records = _Buffer("train_inputs", train_inputs, N_COLUMNS)
             targets = _Buffer("train_targets", train_targets, 3)
@@ -193,7 +193,7 @@ class RadianceCache:
 
         if DispatchFlags.RESET in flags:
             self.reset()
-        predictions = None if points is None else self._infer(points, asked)
+        predictions = None if points is None else self._infer(points, n_queries)
         if records is not None and known:
             self._train(records, targets, known, rate, smoothing)
         counters.clear()

@@ -210,19 +210,19 @@ class SpatialHashCache(IncidentCache):
 
     FIELD, SHAPE = SpatialHash, HashShape
 
-    def learn(self, asked: SpatialHash, records, seed, learning_rate, decay):
+    def learn(self, field: SpatialHash, records, seed, learning_rate, decay):
         """Add the records. The loss, of what was known before them, is relative to the mean target; it steers nothing
         but when training counts as settled."""
         with dr.suspend_grad():
             n_valid = dr.maximum(dr.count(records.valid), 1)
-            y = dr.select(records.valid, dr.clip(records.target / asked.scale, 0, TARGET_MAX), 0)
-            p = asked.raw(asked.encode(records.position, records.normal), records.direction)
+            y = dr.select(records.valid, dr.clip(records.target / field.scale, 0, TARGET_MAX), 0)
+            p = field.raw(field.encode(records.position, records.normal), records.direction)
             error = dr.select(records.valid, loss.relative_l2(p, y, self.training.epsilon), 0)
-            level, said = (dr.select(records.valid, loss.luminance(v), 0) for v in (y, p))
-            dr.eval(y, error, level, said)
-            outputs = [dr.sum(v) / n_valid for v in (error, level, said)]
-            asked.mean = dr.lerp(outputs[1], asked.mean, decay)
+            level, prediction = (dr.select(records.valid, loss.luminance(v), 0) for v in (y, p))
+            dr.eval(y, error, level, prediction)
+            outputs = [dr.sum(v) / n_valid for v in (error, level, prediction)]
+            field.mean = dr.lerp(outputs[1], field.mean, decay)
             kept = 1 - (1 - decay) / MEMORY
-            asked.add(records.position, records.direction, y, records.valid, kept)
-            dr.eval(outputs, asked.mean)
+            field.add(records.position, records.direction, y, records.valid, kept)
+            dr.eval(outputs, field.mean)
         return tuple(outputs)

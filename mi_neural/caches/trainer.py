@@ -2,7 +2,7 @@
 
 A cache says what its records are, what its field is and what one step does (`start`, and a function that is frozen).
 All else is here. A step is queued and not waited for: what it found is written to one small array, and the arrays of
-several steps are read together (:meth:`Trainer.watch`). Steps that would destroy a network are refused where they are
+several steps are read together (:meth:`Trainer.check`). Steps that would destroy a network are refused where they are
 made (:func:`~mi_neural.caches.optimizer.descend`), so that no image sees their result.
 """
 
@@ -21,7 +21,7 @@ from .schedule import pace
 from .voxels import Ages
 
 #: Steps whose findings are read together.
-WATCH_EVERY = 8
+CHECK_EVERY = 8
 #: Sensors of which it is remembered, and which are held alive for it, whether they can be recorded.
 MOST_SENSORS = 16
 
@@ -106,7 +106,7 @@ class Trainer:
     @property
     def statistics(self) -> dict:
         """Counts since the start, under the names of `NAMES`."""
-        self.watch()
+        self.check()
         facts = {name: self._counts[key] for key, name in self.NAMES.items()}
         if self.measure_name and self._measure is not None:
             facts[self.measure_name] = self._measure
@@ -115,13 +115,13 @@ class Trainer:
     @property
     def history(self) -> list[float]:
         """Losses of all steps but those that were undone."""
-        self.watch()
+        self.check()
         return self._history
 
     @property
     def levels(self) -> list[float]:
         """The latest mean targets, over the field's scale."""
-        self.watch()
+        self.check()
         return self._levels
 
     def settled(self) -> bool:
@@ -179,7 +179,7 @@ class Trainer:
     # -------------------------------------------------------------------------------------------------------------
     # Health
 
-    def watch(self) -> None:
+    def check(self) -> None:
         """Read what the latest steps found; undo training that has diverged; begin anew in another light."""
         if not self._unread:
             return
@@ -259,7 +259,7 @@ class Trainer:
         `progress` is called with (done, total), in frames or seconds. The last two limits are for `settled`.
         """
         t0, done = time.perf_counter(), 0
-        self.watch()
+        self.check()
         if self.field is None:
             self.start(*args)
         while True:
@@ -275,22 +275,22 @@ class Trainer:
             self.train_frame(*args)
             done += 1
             # A single frame is not waited for: the next call reads what it found
-            if frames != 1 and (done == 1 or self._novel or len(self._unread) >= WATCH_EVERY or seconds is not None):
-                self.watch()
+            if frames != 1 and (done == 1 or self._novel or len(self._unread) >= CHECK_EVERY or seconds is not None):
+                self.check()
             if progress is not None:
                 if frames is None and seconds is not None:
                     progress(min(time.perf_counter() - t0, seconds), seconds)
                 else:
                     progress(done, frames if frames is not None else at_most)
         if frames != 1:
-            self.watch()
+            self.check()
 
     # -------------------------------------------------------------------------------------------------------------
     # State
 
     def schedule(self) -> dict:
         """Numbers that steer training, apart from the field's."""
-        self.watch()
+        self.check()
         return {"rate_factor": self.rate_factor, "history": list(self._history), "levels": list(self._levels)}
 
     def set_schedule(self, given: dict) -> None:

@@ -107,6 +107,150 @@ def _twin_rays(sensor, sampler, plan: Suffixes, places):
     return dr.gather(mi.Ray3f, rays, dr.arange(mi.UInt32, plan.n_paths) // 2)
 
 
+@dataclass
+class Vertices:
+    """What paths found at their vertices: that of vertex k of path i is entry ``k * n_paths + i``.
+
+    records    outgoing records, their targets still missing
+    emitted    emission met by the BSDF ray that left the vertex, weighed by MIS; Le
+    estimated  next-event estimation at the vertex, weighed by MIS; L_nee
+    weight     ``f cos/p`` of that BSDF ray, whose direction and lobe follow: whether the lobe is smooth
+    stops      see :class:`PathRecords`
+    """
+
+    records: OutgoingRecords
+    emitted: mi.Color3f
+    estimated: mi.Color3f
+    weight: mi.Color3f
+    direction: mi.Vector3f
+    smooth: mi.Bool
+    stops: mi.Bool
+
+    @classmethod
+    def empty(cls, size: int) -> Vertices:
+        colours = (dr.zeros(mi.Color3f, size) for _ in range(3))
+        direction, smooth, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
+        return cls(empty_surfaces(size), *colours, direction, smooth, stops)
+
+    def keep(self, i, si, found: paths.Bounce, terminal, surface) -> None:
+        """Write entries `i`; `surface` is None where only positions and normals are wanted."""
+        dr.scatter(self.emitted, found.Le, i)
+        dr.scatter(self.estimated, found.L_nee, i)
+        dr.scatter(self.weight, found.weight, i)
+        if surface is not None:
+            for to, value in zip(self.records.surface.inputs(), surface.inputs(), strict=True):
+                dr.scatter(to, value, i)
+        else:
+            dr.scatter(self.records.surface.position, si.p, i)
+            dr.scatter(self.records.surface.normal, vertex.facing(si), i)
+        dr.scatter(self.records.valid, terminal, i)
+        dr.scatter(self.direction, found.ray.d, i)
+        dr.scatter(self.smooth, terminal & found.followed & ~found.delta, i)
+
+
+@dataclass
+class _Tracer:
+    """What tracing a training path needs: its bounces are those of a pixel's path, but for `plan.roughening`."""
+
+    scene: mi.Scene
+    lights: object
+    plan: Suffixes
+    glossy: bool
+
+    def surface(self, path, active):
+        return surface_of(path.si, path.si.bsdf(path.ray), active, self.glossy)
+
+    def bounce(self, path, n_rough, sampler, albedo=None):
+        """One bounce, the surface roughened as the path has bounced `n_rough` times before: (Bounce, sampler)."""
+        bsdf = path.si.bsdf(path.ray)
+        if self.plan.roughening > 0:
+            albedo = surface_of(path.si, bsdf, path.active, False).albedo if albedo is None else albedo
+            share = 1 - dr.power(mi.Float(1 - self.plan.roughening), n_rough)
+            opaque = vertex.has_smooth(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+            bsdf = Roughened(bsdf, path.active & opaque & (sampler.next_1d() < share), albedo)
+        return paths.bounce(self.scene, self.lights, path, sampler, bsdf=bsdf)
+
+    def walk(self, path, spread, sampler) -> tuple:
+        """The vertices with records: (Vertices, how many of each path, path, n_rough, whether it goes on, sampler)."""
+        plan, n_kept = self.plan, self.plan.n_vertices - 1
+        lane = dr.arange(mi.UInt32, plan.n_paths)
+        unbounded = lane < plan.n_unbounded
+        vertices = Vertices.empty(plan.n_paths * n_kept)
+
+        def step(k, path, spread, ends, n_rough, open_, sampler):
+            i = k * plan.n_paths + lane
+            terminal = vertex.is_terminal(path.si, path.active)
+            surface = self.surface(path, path.active) if plan.surfaces else None
+            found, sampler = self.bounce(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
+            vertices.keep(i, path.si, found, terminal, surface)
+            path = paths.advance(path, found)
+            open_ = mi.Bool(path.active)
+            if plan.surfaces:
+                terminal = vertex.is_terminal(path.si, open_)
+                spread = spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, terminal)
+                wide = terminal & spread.exceeds(plan.threshold)
+                dr.scatter(vertices.stops, wide, i)
+                if plan.suffix == "spread":
+                    path.active &= ~(wide & (ends > 0)) | unbounded
+                    ends += dr.select(wide, 1, 0)
+                    spread = spread.restarted(wide)
+            return k + 1, path, spread, ends, n_rough + dr.select(found.delta, 0, 1), open_, sampler
+
+        state = (mi.UInt32(0), path, spread, mi.UInt32(0), mi.Float(0), mi.Bool(path.active), sampler)
+        n_vertices, path, _, _, n_rough, open_, sampler = dr.while_loop(
+            state, lambda k, path, spread, ends, n_rough, open_, sampler: path.active & (k < n_kept), step,
+            label="training paths",
+        )  # fmt: skip
+        return vertices, n_vertices, path, n_rough, open_, sampler
+
+    def ends(self, path, n_rough, open_, query: Callable | None, sampler) -> mi.Color3f:
+        """What arrives from beyond the last vertex of each path: the cache, seen through mirrors and glass, or what
+        paths without an end found until roulette ended them."""
+        plan = self.plan
+        unbounded = dr.arange(mi.UInt32, plan.n_paths) < plan.n_unbounded
+
+        def run_on(k, path, n_rough, queries, sampler):
+            found, sampler = self.bounce(path, n_rough, sampler)
+            path, sampler = paths.roulette(paths.advance(path, found), sampler, RR_DEPTH)
+            terminal = vertex.is_terminal(path.si, path.active)
+            queries |= terminal & ~unbounded
+            path.active &= (unbounded & (k < MAX_VERTICES)) | (~unbounded & ~terminal & (k < MAX_CHAIN))
+            return k + 1, path, n_rough + dr.select(found.delta, 0, 1), queries, sampler
+
+        terminal = vertex.is_terminal(path.si, open_)
+        path = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1), depth=mi.UInt32(1),
+                       active=open_ & (unbounded | ~terminal))  # fmt: skip
+        _, path, n_rough, queries, sampler = dr.while_loop(
+            (mi.UInt32(0), path, n_rough, terminal & ~unbounded, sampler),
+            lambda k, path, n_rough, queries, sampler: path.active, run_on, label="ends of training paths",
+        )  # fmt: skip
+        end, path = path.L, replace(path, active=queries)
+        if plan.content == "indirect":  # direct light at the end: it is in S, but not in the cache
+            found, sampler = self.bounce(path, n_rough, sampler)
+            end += dr.select(queries, path.β * found.direct, 0)
+        if query is not None:
+            value, sampler = query(path.si, path.si.bsdf(path.ray), queries, sampler)
+            end += dr.select(queries, path.β * value, 0)
+        return end
+
+
+def _back_to_front(plan: Suffixes, vertices: Vertices, n_vertices, end) -> mi.Color3f:
+    """Fill in the targets of outgoing records, and return those of incident ones: S_{k+1} for each vertex k."""
+    lane = dr.arange(mi.UInt32, plan.n_paths)
+    arrived, S = dr.zeros(mi.Color3f, dr.width(vertices.stops)), mi.Color3f(0)
+    for k in reversed(range(plan.n_vertices - 1)):
+        i = k * plan.n_paths + lane
+        S = dr.select(n_vertices == k + 1, end, S)
+        dr.scatter(arrived, S, i)
+        weight = dr.gather(mi.Color3f, vertices.weight, i)
+        reflected = weight * S
+        direct = dr.gather(mi.Color3f, vertices.estimated, i) + weight * dr.gather(mi.Color3f, vertices.emitted, i)
+        S = direct + reflected
+        if plan.surfaces:
+            dr.scatter(vertices.records.target, reflected if plan.content == "indirect" else S, i)
+    return arrived
+
+
 def trace_training_paths(
     scene, sensor, sampler, plan: Suffixes, query: Callable | None, lights=None, places: tuple | None = None,
     glossy: bool = True, first: Callable | None = None,
@@ -124,121 +268,30 @@ def trace_training_paths(
     nothing). Paths that left the scene, or that run on without an end, are not self-trained. ``first(si, bsdf, active,
     sampler)``, with the same result, is called at the first vertices.
     """
-    n_paths, n_kept = plan.n_paths, plan.n_vertices - 1
-    size = n_paths * n_kept
-    lane = dr.arange(mi.UInt32, n_paths)
-    unbounded = lane < plan.n_unbounded
-
-    records = empty_surfaces(size)
-    E, N, f = (dr.zeros(mi.Color3f, size) for _ in range(3))
-    direction, rough, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
-
-    def surface_at(path, active):
-        return surface_of(path.si, path.si.bsdf(path.ray), active, glossy)
-
-    def step(path, n_rough, sampler, albedo=None):
-        """One bounce, the surface roughened as the path has bounced before: (Bounce, sampler)."""
-        bsdf = path.si.bsdf(path.ray)
-        if plan.roughening > 0:
-            albedo = surface_of(path.si, bsdf, path.active, False).albedo if albedo is None else albedo
-            share = 1 - dr.power(mi.Float(1 - plan.roughening), n_rough)
-            opaque = vertex.has_smooth(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
-            bsdf = Roughened(bsdf, path.active & opaque & (sampler.next_1d() < share), albedo)
-        return paths.bounce(scene, lights, path, sampler, bsdf=bsdf)
-
-    # ------------------------- Vertices with records --------------------------
-    def keep(k, path, found, terminal, surface):
-        i = k * n_paths + lane
-        dr.scatter(E, found.Le, i)
-        dr.scatter(N, found.L_nee, i)
-        dr.scatter(f, found.weight, i)
-        if surface is not None:
-            for to, value in zip(records.surface.inputs(), surface.inputs(), strict=True):
-                dr.scatter(to, value, i)
-        else:
-            dr.scatter(records.surface.position, path.si.p, i)
-            dr.scatter(records.surface.normal, vertex.facing(path.si), i)
-        dr.scatter(records.valid, terminal, i)
-        dr.scatter(direction, found.ray.d, i)
-        dr.scatter(rough, terminal & found.followed & ~found.delta, i)
-
-    def bounce(k, path, spread, ends, n_rough, open_, sampler):
-        terminal = vertex.is_terminal(path.si, path.active)
-        surface = surface_at(path, path.active) if plan.surfaces else None
-        found, sampler = step(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
-        keep(k, path, found, terminal, surface)
-        path = paths.advance(path, found)
-        open_ = mi.Bool(path.active)
-        if plan.surfaces:
-            terminal = vertex.is_terminal(path.si, open_)
-            spread = spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, terminal)
-            wide = terminal & spread.exceeds(plan.threshold)
-            dr.scatter(stops, wide, k * n_paths + lane)
-            if plan.suffix == "spread":
-                path.active &= ~(wide & (ends > 0)) | unbounded
-                ends += dr.select(wide, 1, 0)
-                spread = spread.restarted(wide)
-        return k + 1, path, spread, ends, n_rough + dr.select(found.delta, 0, 1), open_, sampler
-
     if plan.twins:
         ray = _twin_rays(sensor, sampler, plan, places)
     else:
-        ray = first_rays(sensor, sampler, n_paths, plan.world_share, places)
+        ray = first_rays(sensor, sampler, plan.n_paths, plan.world_share, places)
     si = scene.ray_intersect(ray)
     path = paths.start(ray, si, mi.Bool(True))
     terminal, answer = vertex.is_terminal(si, path.active), mi.Color3f(0)
     if first is not None:
         answer, sampler = first(si, si.bsdf(ray), terminal, sampler)
-    spread = PathSpread.start(n_paths).arrive(si, ray, mi.Float(1), mi.Bool(True), terminal)
-    state = (mi.UInt32(0), path, spread, mi.UInt32(0), mi.Float(0), mi.Bool(path.active), sampler)
-    k_end, path, _, _, n_rough, open_, sampler = dr.while_loop(
-        state, lambda k, path, spread, ends, n_rough, open_, sampler: path.active & (k < n_kept), bounce,
-        label="training paths",
-    )  # fmt: skip
+    spread = PathSpread.start(plan.n_paths).arrive(si, ray, mi.Float(1), mi.Bool(True), terminal)
 
-    # ------------- Their ends: seen through mirrors and glass, or run on ----------
-    def run_on(k, path, n_rough, queries, sampler):
-        found, sampler = step(path, n_rough, sampler)
-        path, sampler = paths.roulette(paths.advance(path, found), sampler, RR_DEPTH)
-        terminal = vertex.is_terminal(path.si, path.active)
-        queries |= terminal & ~unbounded
-        path.active &= (unbounded & (k < MAX_VERTICES)) | (~unbounded & ~terminal & (k < MAX_CHAIN))
-        return k + 1, path, n_rough + dr.select(found.delta, 0, 1), queries, sampler
+    tracer = _Tracer(scene, lights, plan, glossy)
+    vertices, n_vertices, path, n_rough, open_, sampler = tracer.walk(path, spread, sampler)
+    end = tracer.ends(path, n_rough, open_, query, sampler)
+    dr.eval(vertices, end, n_vertices, answer)
+    arrived = _back_to_front(plan, vertices, n_vertices, end)
 
-    terminal = vertex.is_terminal(path.si, open_)
-    path = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1), depth=mi.UInt32(1),
-                   active=open_ & (unbounded | ~terminal))  # fmt: skip
-    _, path, n_rough, queries, sampler = dr.while_loop(
-        (mi.UInt32(0), path, n_rough, terminal & ~unbounded, sampler),
-        lambda k, path, n_rough, queries, sampler: path.active, run_on, label="ends of training paths",
-    )  # fmt: skip
-    end, path = path.L, replace(path, active=queries)
-    if plan.content == "indirect":  # direct light at the end: it is in S, but not in the cache
-        found, sampler = step(path, n_rough, sampler)
-        end += dr.select(queries, path.β * found.direct, 0)
-    if query is not None:
-        value, sampler = query(path.si, path.si.bsdf(path.ray), queries, sampler)
-        end += dr.select(queries, path.β * value, 0)
-
-    # ------------------------------ Back to front -----------------------------
-    dr.eval(E, N, f, end, k_end, records, direction, rough, stops, answer)
-    arrived = dr.zeros(mi.Color3f, size)
-    S = mi.Color3f(0)
-    for k in reversed(range(n_kept)):
-        i = k * n_paths + lane
-        S = dr.select(k_end == k + 1, end, S)
-        dr.scatter(arrived, S, i)
-        weight = dr.gather(mi.Color3f, f, i)
-        direct = dr.gather(mi.Color3f, N, i) + weight * dr.gather(mi.Color3f, E, i)
-        reflected = weight * S
-        S = direct + reflected
-        if plan.surfaces:
-            dr.scatter(records.target, reflected if plan.content == "indirect" else S, i)
-
+    records = vertices.records
     finite = dr.all(dr.isfinite(records.target))
     n_bad = dr.count(records.valid & ~finite)
     records.valid &= finite
     records.target = dr.select(records.valid, records.target, 0)
-    incident = TrainingRecords(records.surface.position, direction, records.surface.normal, arrived, rough)
+    surface = records.surface
+    incident = TrainingRecords(surface.position, vertices.direction, surface.normal, arrived, vertices.smooth)
     n_bad = n_bad, leave_out_nonfinite(incident)
-    return PathRecords(records, incident, N + f * E, f, stops, n_bad, answer)
+    direct = vertices.estimated + vertices.weight * vertices.emitted
+    return PathRecords(records, incident, direct, vertices.weight, vertices.stops, n_bad, answer)

@@ -239,7 +239,7 @@ class VisibilityCache(Trainer):
     def train(self, scene, sensor, table, groups, *, frames: int = 1) -> None:
         """So many steps, each on fresh points."""
         t0, done = time.perf_counter(), 0
-        self.watch()
+        self.check()
         if self.field is None:
             self.start(scene, sensor, table, groups)
         while done < frames:
@@ -247,7 +247,7 @@ class VisibilityCache(Trainer):
             self.train_step(scene, sensor, table, groups, batch)
             done += batch
             if frames > 1:  # a single step is not waited for: the next call reads what it found
-                self.watch()
+                self.check()
         self._counts["seconds"] += time.perf_counter() - t0
 
 

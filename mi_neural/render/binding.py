@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-class SceneWatch:
+class BoundScene:
     """Remembers a scene by its shapes and emitters.
 
     It holds the parts, so that no other scene's can lie where they lay; not the scene, which may hold whoever watches.
