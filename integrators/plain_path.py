@@ -10,6 +10,7 @@ from mi_neural.integrators.lighting import LightSamplingIntegrator
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
+from mi_neural.render.spectrum import is_rgb
 
 
 class PlainPathIntegrator(LightSamplingIntegrator):
@@ -47,7 +48,8 @@ class PlainPathIntegrator(LightSamplingIntegrator):
          know lights one by one: no shadow ray, no noise, but a bias, as in ``nvc_direct`` with ``mode=neural``. -1:
          nowhere. (Default: -1)
 
-    *Works with* all surfaces and emitters of Mitsuba. *Leaves out* participating media (use ``volpath``), polarization.
+    *Works with* all surfaces and emitters of Mitsuba, in RGB, mono and spectral variants. *Leaves out* participating
+    media (use ``volpath``), polarization.
 
     .. tabs::
         .. code-tab:: xml
@@ -65,6 +67,8 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         self.neural_depth = props.get("neural_depth", -1)
         self.records = self.neural_depth < 0
         self.unshadowed: UnshadowedLights | None = None
+        if self.neural_depth >= 0 and not is_rgb():
+            raise ValueError("plain_path: neural_depth works in RGB variants alone; leave it out")
         if self.neural_depth < -1:
             raise ValueError(f"plain_path: neural_depth is {self.neural_depth}; give -1 (nowhere), 0, or more")
         if self.neural_depth >= 0 and not getattr(self.light_sampler, "visibility", False):

@@ -17,6 +17,9 @@ from . import llvm
 
 # The variants in which the plugins work: RGB, differentiable (training), on a JIT backend.
 SUPPORTED = ("llvm_ad_rgb", "cuda_ad_rgb")
+# Those in which only what holds no radiance works: the light samplers, and the integrators of `WITHOUT_CACHE`.
+OTHER_COLOURS = ("llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_mono", "cuda_ad_spectral")
+WITHOUT_CACHE = ("plain_path",)
 
 # (package, variant) -> the modules of that package as executed under that variant
 _modules: dict[tuple[str, str], dict[str, ModuleType]] = {}
@@ -36,6 +39,8 @@ def variant_problem(variant: str | None = None) -> str | None:
         why = "scalar variants have no Dr.Jit compiler to train a cache with"
     elif "polarized" in variant:
         why = "the caches do not track polarization"
+    elif variant in OTHER_COLOURS:
+        why = f"the caches hold RGB radiance; {', '.join(WITHOUT_CACHE)} with any light sampler works in it"
     elif "spectral" in variant or "mono" in variant:
         why = "the caches hold RGB radiance"
     elif "_ad_" not in variant:
@@ -109,22 +114,25 @@ def _register_for(variant: str) -> None:
     from . import emitters, integrators
 
     for package, register_plugin in ((emitters, mi.register_emitter), (integrators, mi.register_integrator)):
-        if (text := variant_problem(variant)) is None:
-            _load(package, variant)
-        else:
-            for name in plugin_names(package):
-                register_plugin(name, _refusal(name, text))
+        names = plugin_names(package)
+        text = variant_problem(variant)
+        if text is None or variant in OTHER_COLOURS:
+            works = names if text is None or package is emitters else WITHOUT_CACHE
+            _load(package, variant, works)
+            names = [n for n in names if n not in works]
+        for name in names:
+            register_plugin(name, _refusal(name, text))
 
 
-def _load(package: ModuleType, variant: str) -> None:
-    """Put ``variant``'s modules of ``package`` into place; the first visit executes those of ``package.PLUGINS``."""
+def _load(package: ModuleType, variant: str, names: tuple[str, ...]) -> None:
+    """Put ``variant``'s modules of ``package`` into place; the first visit executes those of the plugins `names`."""
     prefix = f"{package.__name__}."
     for name in [n for n in sys.modules if n.startswith(prefix)]:
         del sys.modules[name]
 
     known = _modules.get((package.__name__, variant))
     if known is None:
-        for name in plugin_names(package):
+        for name in names:
             importlib.import_module(prefix + name)
         known = {n: m for n, m in sys.modules.items() if n.startswith(prefix)}
         _modules[package.__name__, variant] = known

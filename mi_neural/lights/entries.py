@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import parameters
+from ..render.spectrum import as_three, at_probes, is_rgb
 from .sky import REACH, Sky
 
 LOCAL, DIRECTION, ENVIRONMENT = range(3)
@@ -68,6 +69,8 @@ def _read(columns, row: int, emitter) -> bool:
     """
     kind, shape = emitter.class_name(), emitter.get_shape()
     if shape is None and kind == "PointLight":
+        if not is_rgb():
+            return False
         values = _constant(parameters.traverse(emitter), "intensity")
         if values is not None:
             center = np.array(emitter.bbox().min, np.float64).ravel()
@@ -76,7 +79,7 @@ def _read(columns, row: int, emitter) -> bool:
     round_ = shape.class_name() if shape is not None and kind == "AreaLight" else ""
     if round_ not in ("Sphere", "Disk", "Cylinder"):
         return False
-    radiance = _constant(parameters.traverse(emitter), "radiance")
+    radiance = _constant(parameters.traverse(emitter), "radiance") if is_rgb() else None
     known = dict(radiance=radiance, plain=radiance is not None)
     if round_ == "Cylinder":
         return _read_cylinder(columns, row, emitter, shape, known)
@@ -119,7 +122,7 @@ def _read_cylinder(columns, row: int, emitter, shape, known: dict) -> bool:
         si.p = cylinder_point(*(mi.Vector3f(*M[:, k].tolist()) for k in (3, 0, 1, 2)), si.uv)[0]
         si.n, si.wi, si.t = mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(1)
         si.sh_frame = mi.Frame3f(si.n)
-        values = np.array(emitter.eval(si) + dr.zeros(mi.Color3f, PROBES**2), np.float64)
+        values = np.array(as_three(emitter.eval(at_probes(si))) + dr.zeros(mi.Color3f, PROBES**2), np.float64)
         known = known | {"radiance": np.nan_to_num(values, posinf=0, neginf=0).mean(axis=1)}
     _put(columns, row, form=form, corner=M[:, 3], edge1=M[:, 0], edge2=M[:, 1], normal=M[:, 2], area=area,
          center=center, radius=1.001 * np.linalg.norm(ends, axis=1).max(), intensity=area * known["radiance"].mean(),
@@ -216,13 +219,14 @@ def _look_at(columns, scene, rows: list[int], emitters: list, u) -> tuple[list, 
     if not unsampled.all():
         it = seen_from(mi.Point3f(*middle.tolist()) + dr.zeros(mi.Point3f, n))
         ds, weight = lights.sample_direction(it, u, active)
+        weight = as_three(weight)
     if (surface & ~unsampled).any():  # points all over them
         on = active & (mi.Bool(np.repeat(surface, k)) if m > 1 else mi.Bool(True))
         ps = lights.get_shape().sample_position(mi.Float(0), u, on)
         si = dr.zeros(mi.SurfaceInteraction3f, n)
         si.p, si.n, si.uv, si.wi, si.t = ps.p, ps.n, ps.uv, mi.Vector3f(0, 0, 1), mi.Float(1)
         si.sh_frame = mi.Frame3f(ps.n)
-        Le = lights.eval(si, on)
+        Le = as_three(lights.eval(at_probes(si), on))
     dr.eval(ds.d, ds.p, weight, ps.p, ps.n, Le)
 
     def probes(v):
@@ -276,7 +280,7 @@ def _glow(lamps, places: np.ndarray) -> np.ndarray:
     if m > 1:
         lamps = dr.gather(mi.EmitterPtr, lamps, dr.repeat(dr.arange(mi.UInt32, m), k))
     _, weight = lamps.sample_direction(it, mi.Point2f(0.5), True)
-    weight = np.array(weight + dr.zeros(mi.Color3f, m * k), np.float64).T.reshape(m, k, 3)
+    weight = np.array(as_three(weight) + dr.zeros(mi.Color3f, m * k), np.float64).T.reshape(m, k, 3)
     return np.nan_to_num(weight, posinf=0, neginf=0).mean(axis=2).max(axis=1)
 
 
@@ -284,7 +288,7 @@ def seen_from(p):
     """An interaction that serves emitters as the point they are seen from."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p, it.n = mi.Point3f(p), mi.Normal3f(0, 0, 1)
-    return it
+    return at_probes(it)
 
 
 # ---------------------------------------------------------------- meshes
@@ -317,7 +321,7 @@ def _meshes(columns, scene, counts, is_mesh, rng) -> None:
     ray = mi.Ray3f(dr.zeros(mi.Point3f, m * k), mi.Vector3f(0, 0, 1))
     si = interaction(on, mi.UInt32(prim[rows]), uv, ray, mi.Bool(True))
     si.wi = mi.Vector3f(0, 0, 1)
-    Le = lights.eval(si, True)
+    Le = as_three(lights.eval(at_probes(si), True))
     dr.eval(si, Le)
     wide = lambda v: np.array(v, np.float64).T.reshape(m, k, 3)  # noqa: E731
     p, n_geo, n_sh = wide(si.p), wide(si.n), wide(si.sh_frame.n)
@@ -339,7 +343,7 @@ def _meshes(columns, scene, counts, is_mesh, rng) -> None:
     columns["form"][flat] = TRIANGLE
     put("corner", p0), put("edge1", p1 - p0), put("edge2", p2 - p0), put("normal", normal)
     put("area", 0.5 * length), put("radiance", radiance)
-    put("plain", constant & ~bent & ~(varies & np.ones(len(counts), bool))[emitter[flat]])
+    put("plain", is_rgb() & constant & ~bent & ~(varies & np.ones(len(counts), bool))[emitter[flat]])
     center = (p0 + p1 + p2) / 3
     put("center", center)
     put("radius", np.sqrt(np.max([((p - center) ** 2).sum(axis=1) for p in (p0, p1, p2)], axis=0)))

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import parameters
+from ..render.spectrum import as_three, at_probes
 
 #: Texels a side, at least and at most. The most are 6 million bytes a hundred texels a side, and 0.4 degrees a texel.
 SIZES = (32, 512)
@@ -73,11 +74,11 @@ class Sky:
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
         within = (mi.Point2f(mi.Float(lane % k % side), mi.Float(lane % k // side)) + jitter) / side
         looks = self.radiance(environment, self.at(lane // k, within))
-        looks = np.array(mi.luminance(looks) + dr.zeros(mi.Float, n * k), np.float64).reshape(n, k)
-        it = dr.zeros(mi.Interaction3f, n * k)
+        looks = np.array(mi.luminance(as_three(looks)) + dr.zeros(mi.Float, n * k), np.float64).reshape(n, k)
+        it = at_probes(dr.zeros(mi.Interaction3f, n * k))
         it.p = mi.Point3f(*np.nan_to_num(np.array(scene.bbox().center()).ravel()).tolist())
         ds, weight = environment.sample_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()), True)
-        share = np.array(mi.luminance(weight) + dr.zeros(mi.Float, n * k), np.float64)
+        share = np.array(mi.luminance(as_three(weight)) + dr.zeros(mi.Float, n * k), np.float64)
         texel = np.array(self.texel_of(ds.d) + dr.zeros(mi.UInt32, n * k))
         clean = lambda v: np.maximum(np.nan_to_num(v, nan=0, posinf=0, neginf=0), 0)  # noqa: E731
         found = np.bincount(texel, clean(share), n) / (n * k)
@@ -100,21 +101,23 @@ class Sky:
         cell = mi.Point2u(dr.fmin(dr.fmax(to_square(d) * self.size, 0), self.size - 1))  # NaN: the first
         return cell.y * self.size + cell.x
 
-    def sample(self, scene, p, texel, sample, active):
-        """A point of a texel as seen from `p`: (direction sample, radiance over its density)."""
+    def sample(self, scene, si, texel, sample, active):
+        """A point of a texel as seen from `si`: (direction sample, radiance over its density)."""
         environment = scene.emitters()[self.emitter]
         ds = dr.zeros(mi.DirectionSample3f, dr.width(texel))
         ds.d = self.at(texel, sample)
         ds.dist = mi.Float(self.distance)
-        ds.p, ds.n = p + ds.d * self.distance, mi.Normal3f(-ds.d)
+        ds.p, ds.n = si.p + ds.d * self.distance, mi.Normal3f(-ds.d)
         ds.pdf, ds.delta = mi.Float(1 / self.solid_angle), mi.Bool(False)
         ds.emitter = mi.EmitterPtr(environment)
-        return ds, self.radiance(environment, ds.d, active) * self.solid_angle
+        return ds, self.radiance(environment, ds.d, active, si) * self.solid_angle
 
     @staticmethod
-    def radiance(environment, d, active=True):
-        """Radiance that arrives from `d`."""
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(d))
+    def radiance(environment, d, active=True, seen_from=None):
+        """Radiance that arrives from `d`, in the wavelengths of `seen_from` or at those of the probes."""
+        si = at_probes(dr.zeros(mi.SurfaceInteraction3f, dr.width(d)))
+        if mi.is_spectral and seen_from is not None:
+            si.wavelengths = seen_from.wavelengths
         si.t, si.wi = mi.Float(dr.inf), -d
         return environment.eval(si, active)
 

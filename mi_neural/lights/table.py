@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..render.spectrum import is_rgb
 from .entries import (
     CYLINDER,
     CYLINDER_INSIDE,
@@ -55,7 +56,8 @@ class LightTable:
     prim      primitive of the emitter's shape
     area      of what is sampled by area, and of spheres; 0 elsewhere
     radiance  mean emitted radiance of all these, intensity of points
-    plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is
+    plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is; nowhere but in
+              RGB variants
     kind      LOCAL, DIRECTION or ENVIRONMENT (as a whole; its texels are of kind DIRECTION)
     center, radius   bounding sphere of a LOCAL entry; DIRECTION: `center` is the direction towards the light
     axis, cone       mean normal, and cosine of the largest angle of a normal to it; -1: light leaves in all directions.
@@ -155,7 +157,7 @@ class LightTable:
         light does not reach `si`; of delta lights it is 1, and `ds.delta` is set. No shadow ray is traced.
         """
         form = self._form(index, active)
-        ds, weight, pdf = dr.zeros(mi.DirectionSample3f, dr.width(index)), mi.Color3f(0), mi.Float(0)
+        ds, weight, pdf = dr.zeros(mi.DirectionSample3f, dr.width(index)), mi.Spectrum(0), mi.Float(0)
         cases = []
         if self._has(*PLANE, *CYLINDERS):
             mine = active & _by_area(form)
@@ -172,7 +174,7 @@ class LightTable:
             cases.append((mine, ds_other, w_other, ds_other.pdf))
         if self.sky is not None:
             mine = active & self._is_texel(index)
-            ds_sky, w_sky = self.sky.sample(scene, si.p, index - self.sky.first, sample, mine)
+            ds_sky, w_sky = self.sky.sample(scene, si, index - self.sky.first, sample, mine)
             cases.append((mine, ds_sky, w_sky, ds_sky.pdf))
         for k, (mine, ds_one, w_one, pdf_one) in enumerate(cases):
             ds = dr.select(mine, ds_one, ds) if k else ds_one
@@ -233,7 +235,7 @@ class LightTable:
         ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
         ds.p, ds.n, ds.uv, ds.d, ds.dist = p, mi.Normal3f(normal), mi.Point2f(uv), d, dr.sqrt(d2)
         ds.pdf, ds.delta = pdf, mi.Bool(False)
-        radiance = dr.gather(mi.Color3f, self.radiance, index, active)
+        radiance = dr.gather(mi.Color3f, self.radiance, index, active) if is_rgb() else mi.Spectrum(0)
         if not self.all_plain:
             varied = active & ~dr.gather(mi.Bool, self.plain, index, active)
             emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, varied),
@@ -246,6 +248,8 @@ class LightTable:
             if self._has(*CYLINDERS):
                 round_ = varied & ((form == CYLINDER) | (form == CYLINDER_INSIDE))
                 at = dr.select(round_, _surface(p, normal, uv, d, ds.dist), at)
+            if mi.is_spectral:
+                at.wavelengths = si.wavelengths
             radiance = dr.select(varied, emitter.eval(at, varied), radiance)
         return ds, dr.select(pdf > 0, radiance / pdf, 0), pdf
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from .frozen import can_freeze, undisturbed
 from .sampling import PathSampler
+from .spectrum import film_colour
 
 #: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (manual, 6_measured).
 PASS_SAMPLES = 2**20
@@ -60,7 +61,7 @@ def camera_rays(sensor, area: Area, pixel, sampler) -> tuple:
         time += sampler.next_1d() * sensor.shutter_open_time()
     unit = place / mi.Vector2f(mi.ScalarVector2f(area.size))
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), unit, aperture)
-    return ray, mi.Color3f(weight), place, sampler
+    return ray, weight, place, sampler
 
 
 def film_rays(sensor, place, sampler) -> mi.Ray3f:
@@ -248,7 +249,7 @@ def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixe
         ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
 
         L, valid, extra = estimate(scene, lights, field, sampler, ray, settings, active)
-        L = mi.Color3f(L * weight)
+        L = film_colour(L * weight, ray.wavelengths, active)
         ok = dr.all(dr.isfinite(L))
         L = dr.select(ok, L, 0)
         values = [L.x, L.y, L.z]
