@@ -84,6 +84,8 @@ class CacheIntegrator(FilmIntegrator):
 
     #: Numbers of a pixel while an image is made: colour, alpha, weight, and copies of them.
     PIXEL_BYTES = 4 * FILM_VALUES
+    #: Training paths of a step where no key says it.
+    TRAIN_SAMPLES = Training.n_paths
     #: Whether the plan may choose a light sampler where none is nested.
     CHOOSES_LIGHTS = False
 
@@ -101,7 +103,7 @@ class CacheIntegrator(FilmIntegrator):
         try:
             blend = props.get("blend", self.default_blend(props))
             training = Training(
-                n_paths=props.get("train_samples", 4096),
+                n_paths=props.get("train_samples", self.TRAIN_SAMPLES),
                 n_vertices=props.get("train_vertices", 8),
                 learning_rate=props.get("learning_rate", self.default_rate(blend)),
                 ema_decay=props.get("ema_decay", 0.99),

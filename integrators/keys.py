@@ -57,7 +57,7 @@ def register(name: str, cls) -> None:
 
 
 #: Keys of ``nirc`` that had no meaning with ``termination="auto"``, and the names of its channels in ``neural_path``.
-WITHOUT_MEANING = ("termination", "light_samples", "gather_half", "cache")
+WITHOUT_MEANING = ("termination", "light_samples", "gather_half", "cache", "cache_samples")
 CHANNELS_OF_NIRC = {"direct": "traced", "cache": "cached"}
 
 
@@ -78,8 +78,8 @@ def older_name(keys: Keys):
         if "channels" in wanted:
             names = [n.strip() for n in wanted["channels"].split(",")]
             wanted["channels"] = ",".join(CHANNELS_OF_NIRC.get(n, n) for n in names)
-        if "learning_rate" in wanted:  # that of its incident cache
-            wanted["learning_rate"] *= 3.0
+        if "learning_rate" in wanted:  # that of an incident cache
+            wanted["learning_rate"] *= 6.0
     return mi.load_dict({"type": "neural_path", **wanted})
 
 
@@ -101,7 +101,7 @@ SHARED_KEYS = (
        - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
      * - train_samples
        - |int|
-       - Training paths per frame. (Default: 4096)
+       - Training paths per frame. (Default: 4096, ``nrc`` and ``neural_path`` 2048)
      * - train_vertices
        - |int|
        - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)
@@ -110,9 +110,8 @@ SHARED_KEYS = (
        - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
      * - learning_rate
        - |float|
-       - Of Adam, at the start; falls to a tenth. In ``neural_path`` it is that of the outgoing cache; the incident one
-         learns at a third of it. (Default: 0.01, ``nrc`` and ``neural_path`` 0.03, but 0.01 with a ``blend`` other than
-         ``ema``)
+       - Of Adam, at the start; falls to a tenth. (Default: 0.01, ``nrc`` and ``neural_path`` 0.06, but ``nrc`` 0.01
+         with a ``blend`` other than ``ema``)
      * - ema_decay
        - |float|
        - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)

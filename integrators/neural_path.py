@@ -1,66 +1,64 @@
-"""``neural_path``: at each vertex the outgoing cache, the incident cache or another bounce."""
+"""``neural_path``: the cache at the first surface as far as it is right, and at the end of paths."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural.caches.accuracy import MeasuredCache
 from mi_neural.caches.blend import where_active
-from mi_neural.caches.incident import reflect
-from mi_neural.caches.outgoing import RATE
-from mi_neural.caches.pair import PairCache
+from mi_neural.caches.outgoing import OutgoingShape
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix, vertex
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
-#: Queries a camera sample, at its first vertex and at its end; fewer where only one of them is queried, more where the
-#: end is in the incident cache.
+#: Queries a camera sample, at its first surface and at its end.
 QUERIES = 2.0
+#: A denoiser removes as much noise as so many times the samples, and its images have the least FLIP with this spread
+#: threshold (manual, 6_measured).
+DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
+#: Samples a pixel at which the spread threshold has grown to 1.
+FULL = 256
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
     def __init__(self, props):
         super().__init__(props)
-        self.cache_samples = props.get("cache_samples", 4)
-        self._check(self.cache_samples > 0, f"cache_samples is {self.cache_samples}; it must be at least 1")
+        self.denoised = props.get("denoised", False)
+        if self.denoised and "spread_threshold" not in props:
+            self.spread_threshold = DENOISED_THRESHOLD
         self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; neural_path needs 'ema'")
-        shared, sizes = self.cache.training, self.cache.shape
-        self._check(shared.n_paths > 1, f"train_samples is {shared.n_paths}; training paths come in pairs, at least 2")
-        incident = replace(shared, learning_rate=shared.learning_rate / RATE)
-        self.cache = PairCache(self.outgoing_training(), incident, sizes, self.seed, n_queries=self.cache_samples)
+        n = self.cache.training.n_paths
+        self._check(n > 1, f"train_samples is {n}; training paths come in pairs, at least 2")
+        self.cache = MeasuredCache(self.outgoing_training(), OutgoingShape.like(self.cache.shape), self.seed)
 
     @property
     def caches(self) -> tuple[str, ...]:
-        return ("outgoing", "incident")
-
-    def settings(self, spp: int) -> tuple:
-        return (float(spp),)
+        return ("outgoing",)
 
     @property
     def queries_per_sample(self) -> float:
         return QUERIES if self.needs_cache else 0.0
 
+    def settings(self, spp: int) -> tuple:
+        """Samples that the noise is averaged over, and the spread threshold."""
+        return float(spp) * (DENOISED_SAMPLES if self.denoised else 1), max(self.spread_threshold, spp / FULL)
+
     # -------------------------------------------------------------------------------------------------------------
 
     def estimate(self, scene, lights, field, sampler, ray, settings, active):
-        """E[L] = Le + w L_o(x_1) + (1 - w) [direct light + what a path gathers that ends in either cache].
+        """E[L] = Le + w L_o(x_1) + (1 - w) [direct light + what a path gathers that ends in the cache when it is wide].
 
-        `field`: a :class:`~mi_neural.caches.pair.PairField`; None: path tracing. The first share w depends on nothing
-        but the place and the number of samples of the finished image, so E[L] is right where both estimates are.
+        `field`: a :class:`~mi_neural.caches.accuracy.MeasuredField`; None: path tracing. The share w depends on nothing
+        but the place and the number of samples of the finished image.
         """
-        (n_samples,) = settings
-        cached = self.needs_cache and field is not None
-        glossy = scene_is_glossy(scene)
+        n_samples, threshold = settings
+        cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
 
         def stop(si, spread, smooth, first, sampler):
-            share, incident = field.accuracy.choose(si.p, vertex.facing(si), n_samples, smooth)
-            incident &= ~mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)  # its reflections are not in the cache
-            wide = smooth & ~first & spread.exceeds(self.spread_threshold)
-            ends = wide & (sampler.next_1d() < field.accuracy.stops(si.p, n_samples, wide))
-            return share, ends, incident & (first | wide) & ~ends, sampler
+            share = field.grid.share(si.p, vertex.facing(si), n_samples, smooth)
+            return share, smooth & ~first & spread.exceeds(threshold), mi.Bool(False), sampler
 
         end, sampler = prefix.trace(
             self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=cached
@@ -72,33 +70,22 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         if not cached:
             return path.L, path.valid, channels
 
-        def outgoing(*inputs):
-            return tuple(field.outgoing.query(*inputs))
+        def query(active, surface):
+            return mi.Color3f(*where_active(active, surface.inputs(), lambda *inputs: tuple(field.query(*inputs)), 3))
 
         shows = bool({"cache", "density"} & set(self.channels))
         seen = (dr.max(end.β_first) > 0) & ((end.share > 0) | shows)
-        at_first = end.β_first * mi.Color3f(*where_active(seen, end.first.inputs(), outgoing, 3))
-        bsdf = path.si.bsdf(path.ray)
-        at_end = surface_of(path.si, bsdf, end.ends, glossy)
-        at_end = mi.Color3f(*where_active(end.ends, at_end.inputs(), outgoing, 3))
-
-        lit = end.ends_lit
-        point = mi.Point3f(path.si.p), vertex.facing(path.si)
-        features = where_active(
-            lit, point, lambda x, n: tuple(field.incident.encode(x, n)), field.incident.shape.n_encoded
-        )
-        by_incident, sampler = reflect(
-            field.incident, list(features), path.si, bsdf, self.cache.n_queries, sampler, lit
-        )
-        cached = end.share * at_first + path.β * (dr.select(end.ends, at_end, 0) + dr.select(lit, by_incident, 0))
+        at_first = end.β_first * query(seen, end.first)
+        at_end = path.β * query(end.ends, surface_of(path.si, path.si.bsdf(path.ray), end.ends, glossy))
+        cached = end.share * at_first + dr.select(end.ends, at_end, 0)
         channels |= {"cached": cached, "cache": at_first}
         if shows:
-            channels["density"] = dr.select(seen, field.outgoing.density_at(end.first.position), 0)
+            channels["density"] = dr.select(seen, field.field.density_at(end.first.position), 0)
         return path.L + cached, path.valid, channels
 
     def to_string(self):
         return (
-            f"NeuralPathIntegrator[\n  spread_threshold = {self.spread_threshold},\n"
+            f"NeuralPathIntegrator[\n  denoised = {self.denoised},\n  spread_threshold = {self.spread_threshold},\n"
             f"  max_depth = {self.max_depth},\n"
             f"  training = {self.cache.training},\n  network = {self.cache.shape},\n"
             f"  frames trained = {self.cache.steps},\n  plan = {self.state.plan or self.plan_mode}\n]"
@@ -115,33 +102,34 @@ NeuralPathIntegrator.__doc__ = (
     Path tracer that ends in neural caches (:monosp:`neural_path`)
     --------------------------------------------------------------
 
-    Estimates all light with little noise and a small bias that vanishes as samples are added. It has a cache of
-    outgoing radiance (as ``nrc``) and one of incident radiance (as ``nirc``), trained on the same paths, and decides at
-    each vertex by their errors, which are measured while training, without a reference and without further rays.
+    Estimates all light with little noise and a small bias that vanishes as samples are added. It is the integrator to
+    take where no reason speaks for another. It has a cache of outgoing radiance (as ``nrc``), and measures while
+    training how wrong the cache is, without a reference and without further rays.
 
     Training paths are traced in pairs from the same first vertex, so that two independent estimates T, T' of the same
-    radiance exist. Over such pairs the mean of (A - T)(A - T') is the squared bias of a cache's answer A
-    (:math:`b_o^2`; of the incident cache :math:`b_i^2`, its noise :math:`v_i`) and that of (T - T')²/2 the noise v of
-    tracing on, all by cells of 1/16 of the box. For an image of N samples a pixel:
+    radiance exist. Over such pairs the mean of (A - T)(A - T') is the squared bias :math:`b^2` of the cache's answer A,
+    and that of (T - T')²/2 the noise v of tracing on, both by cells of 1/16 of the box. For an image of N samples a
+    pixel:
 
-    - First vertex: what is traced either ends right there, in the incident cache, or goes on. It is mixed with the
-      outgoing cache's answer by the weight of least squared error, :math:`v/N / (v/N + b_o^2)` if it goes on. Of the
-      two, that one is taken whose mix has the smaller error in equal time.
-    - Later vertices, once the path is wide (``spread_threshold``): the outgoing cache with probability
-      :math:`1/(1 + N m^2/v)`, m being its mean error over a region; else incident cache or another bounce as above.
+    - First surface: the cache's answer is mixed with what is traced, by the weight of least squared error,
+      :math:`v/N / (v/N + b^2)`.
+    - Later vertices: the path ends in the cache where it is wide. The threshold c of the spread test grows with N, so
+      that many samples trace further before they end.
 
-    So the first samples show the caches, more samples trust them less, and :math:`E[L_o]` tends to the path-traced
-    radiance.
+    So the first samples show the cache, more samples trust it less, and :math:`E[L_o]` tends to the path-traced
+    radiance. A denoiser removes noise, but no bias: for an image that is to be denoised, set ``denoised``.
+    ``mi-neural`` does with ``--denoise``.
 
     .. pluginparameters::
 
+     * - denoised
+       - |bool|
+       - The image will be denoised: noise counts as in 100 times as many samples, and ``spread_threshold`` is 1.
+         (Default: false)
      * - spread_threshold
        - |float|
-       - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4); infinity: path
-         tracing. (Default: 0.01)
-     * - cache_samples
-       - |int|
-       - Directions in which the incident cache is queried at the end of a path. (Default: 4)"""
+       - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where
+         that is more; infinity: path tracing. (Default: 0.01)"""
     + OUTGOING_KEYS
     + SHARED_KEYS
     + r"""

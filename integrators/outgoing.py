@@ -43,6 +43,7 @@ class OutgoingIntegrator(CacheIntegrator):
     """Base of the integrators that train a cache of outgoing radiance."""
 
     CHOOSES_LIGHTS = True
+    TRAIN_SAMPLES = OutgoingTraining.n_paths
     content = "reflected"
 
     def __init__(self, props):

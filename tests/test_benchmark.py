@@ -441,6 +441,15 @@ def has_denoiser() -> bool:
     return True
 
 
+def test_integrators_are_told_that_their_images_will_be_denoised(loaded):
+    specs = [load.parse_integrator(s) for s in ("path", "neural_path", "neural_path:denoised=false")]
+    known = [benchmark.make_cases(loaded, specs, denoise=d) for d in (False, True)]
+    assert [[getattr(c.integrator, "denoised", None) for c in cases] for cases in known] == [
+        [None, False, False], [None, True, False],
+    ]  # fmt: skip
+    assert known[1][1].spec.label == "neural_path"
+
+
 def test_rows_hold_what_the_contract_names(measured):
     pictures, _ = measured
     rows = [p.row for p in pictures]

@@ -389,17 +389,18 @@ def _relmse(images: list[np.ndarray], reference: Reference) -> tuple[float, floa
 
 
 def make_cases(
-    loaded: LoadedScene, specs: list[IntegratorSpec], optional: dict[str, object] | None = None
+    loaded: LoadedScene, specs: list[IntegratorSpec], optional: dict[str, object] | None = None, denoise: bool = False
 ) -> list[Case]:
-    """Build the integrators with the scene's own depth.
+    """Build the integrators with the scene's own depth; with `denoise` for images that will be denoised, where they
+    know the difference.
 
     `optional` keys go to every integrator that knows them; one that none knows is an error.
     """
     from .load import InputError
 
-    cases = []
+    cases, carried = [], {**loaded.carried, **({"denoised": True} if denoise else {})}
     for spec in specs:
-        integrator, keys = build_integrator(spec, loaded.carried, optional)
+        integrator, keys = build_integrator(spec, carried, optional)
         cases.append(Case(spec, integrator, keys))
     for key in optional or {}:
         if not any(key in case.keys for case in cases):

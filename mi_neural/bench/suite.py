@@ -155,7 +155,7 @@ class Suite:
             parameters = {key: value for key, value in parameters.items() if key in has}
         loaded = load.load_scene(str(file), settings.sizes, parameters)
         loaded.name = name
-        cases = benchmark.make_cases(loaded, settings.specs, settings.keys)
+        cases = benchmark.make_cases(loaded, settings.specs, settings.keys, settings.denoise)
         labels = ", ".join(spec.label for spec in settings.specs)
         terminal.announce(f"{name} {loaded.size[0]}x{loaded.size[1]}, {labels}")
         reference = self._reference(loaded)

@@ -29,6 +29,8 @@ class Blend:
     """
 
     DRJIT_STRUCT = {"field": object, "fast": object, "grid": object}  # noqa: RUF012
+    #: The grid belongs into files.
+    IN_FILES = True
 
     def __init__(self, field: Field, mode: str, constants: Reliability | None = None):
         self.field, self.mode = field, mode

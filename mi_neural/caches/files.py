@@ -18,7 +18,6 @@ KINDS = {
     "spatial_hash": "holds no spatial hash; train and save one with cache='spatial_hash'",
     "sh_grid": "holds no grid of spherical harmonics; train and save one with cache='sh_grid'",
     "outgoing": "holds no outgoing radiance; train an outgoing cache and save it",
-    "pair": "does not hold both incident and outgoing radiance; train and save a cache with neural_path",
 }
 #: Largest size of all arrays together, in bytes: a damaged or hostile file must not fill the memory.
 LARGEST = 2**31

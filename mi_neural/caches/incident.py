@@ -279,7 +279,7 @@ class IncidentCache(Trainer):
         """Write all that training changes, and `facts` (JSON values), to a file, whole or not at all."""
         schedule = self.schedule()
         queried, extra, constants = self.queried, {}, None
-        if isinstance(queried, Blend) and queried.grid is not None:
+        if getattr(queried, "IN_FILES", False) and queried.grid is not None:
             extra, constants = queried.grid.arrays(), asdict(queried.grid.constants)
         extra = extra | {f"ages.{k}": v for k, v in self.ages.arrays().items()}
         self.field.save(path, extra, training=schedule, reliability=constants, **facts)

@@ -66,7 +66,6 @@ class PathRecords:
     weight     ``f cos/p`` of the BSDF ray that left it
     stops      whether the vertex that the ray met is where a pixel's path would end in the cache
     n_bad      how many outgoing and incident records were left out because their targets were not finite
-    first      answers of ``first`` at the first vertices, one for each path
     """
 
     outgoing: OutgoingRecords
@@ -75,7 +74,6 @@ class PathRecords:
     weight: mi.Color3f
     stops: mi.Bool
     n_bad: tuple
-    first: mi.Color3f
 
 
 def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple | None):
@@ -253,7 +251,7 @@ def _back_to_front(plan: Suffixes, vertices: Vertices, n_vertices, end) -> mi.Co
 
 def trace_training_paths(
     scene, sensor, sampler, plan: Suffixes, query: Callable | None, lights=None, places: tuple | None = None,
-    glossy: bool = True, first: Callable | None = None,
+    glossy: bool = True,
 ) -> PathRecords:  # fmt: skip
     """Training paths; each terminal vertex (see ``vertex.is_terminal``), but the last, gives one record.
 
@@ -265,8 +263,7 @@ def trace_training_paths(
     BSDF sample's weight. It is the target of outgoing records for the content ``reflected``; for ``indirect`` that is
     ``f_k S_{k+1}``. The target of an incident record at vertex k is S_{k+1}. At the end of a path ``query(si, bsdf,
     active, sampler)``, which returns (value, sampler), stands for what the cache holds of S (self-training; None:
-    nothing). Paths that left the scene, or that run on without an end, are not self-trained. ``first(si, bsdf, active,
-    sampler)``, with the same result, is called at the first vertices.
+    nothing). Paths that left the scene, or that run on without an end, are not self-trained.
     """
     if plan.twins:
         ray = _twin_rays(sensor, sampler, plan, places)
@@ -274,15 +271,13 @@ def trace_training_paths(
         ray = first_rays(sensor, sampler, plan.n_paths, plan.world_share, places)
     si = scene.ray_intersect(ray)
     path = paths.start(ray, si, mi.Bool(True))
-    terminal, answer = vertex.is_terminal(si, path.active), mi.Color3f(0)
-    if first is not None:
-        answer, sampler = first(si, si.bsdf(ray), terminal, sampler)
+    terminal = vertex.is_terminal(si, path.active)
     spread = PathSpread.start(plan.n_paths).arrive(si, ray, mi.Float(1), mi.Bool(True), terminal)
 
     tracer = _Tracer(scene, lights, plan, glossy)
     vertices, n_vertices, path, n_rough, open_, sampler = tracer.walk(path, spread, sampler)
     end = tracer.ends(path, n_rough, open_, query, sampler)
-    dr.eval(vertices, end, n_vertices, answer)
+    dr.eval(vertices, end, n_vertices)
     arrived = _back_to_front(plan, vertices, n_vertices, end)
 
     records = vertices.records
@@ -294,4 +289,4 @@ def trace_training_paths(
     incident = TrainingRecords(surface.position, vertices.direction, surface.normal, arrived, vertices.smooth)
     n_bad = n_bad, leave_out_nonfinite(incident)
     direct = vertices.estimated + vertices.weight * vertices.emitted
-    return PathRecords(records, incident, direct, vertices.weight, vertices.stops, n_bad, answer)
+    return PathRecords(records, incident, direct, vertices.weight, vertices.stops, n_bad)

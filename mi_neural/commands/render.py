@@ -77,7 +77,7 @@ def render(
     loaded = load.load_scene(scene, wanted_size, parameters, None if spec else keys)
     if spec:
         spec.keys = {**keys, **spec.keys}
-        case = benchmark.make_cases(loaded, [spec])[0]
+        case = benchmark.make_cases(loaded, [spec], denoise=denoise_)[0]
     else:
         case = benchmark.own_case(loaded, keys)
     terminal.require_cache_methods(case, pretrain, save_cache, load_cache)

@@ -90,7 +90,7 @@ def sequence(
     if functions and len(loaded.scene.shapes()) > MANY_SHAPES and changes.of_sensors(loaded.scene, functions):
         loaded = load.load_scene(scene, wanted_size, parameters)
     crops = terminal.parse_crops(crop, loaded.size)
-    cases = benchmark.make_cases(loaded, specs, keys)
+    cases = benchmark.make_cases(loaded, specs, keys, denoise_)
     over_time = sequences.Sequence(loaded.scene, functions, frames, change_at)
     terminal.announce(
         f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {frames} frames, {len(set(over_time.states))} states, "
