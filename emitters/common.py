@@ -8,6 +8,7 @@ import mitsuba as mi
 from mi_neural import parameters, plan
 from mi_neural.lights.table import LightTable
 from mi_neural.render.binding import BoundScene
+from mi_neural.render.frozen import is_recording
 
 
 class LightSampler(mi.Emitter):
@@ -67,8 +68,14 @@ class LightSampler(mi.Emitter):
     def lights(self, scene, sensor, train: bool = True):
         """What chooses lights in `scene`; None where there is nothing to choose, at no cost then.
 
-        The table is made anew where the scene is another one, or its lights changed.
+        The table is made anew where the scene is another one, or its lights changed. Raises RuntimeError inside a
+        function that the user has frozen: a replay would show lights as they were.
         """
+        if is_recording() and not (self.scene.knows(scene) and self.edits is None):
+            raise RuntimeError(
+                f"{self.plugin}: inside a function frozen by dr.freeze a light sampler cannot follow the lights; leave "
+                "it out there, for example mi.load_dict({'type': 'plain_path'})"
+            )
         if self.scene.changed(scene):
             self.reset()
             self.sampler = None

@@ -226,6 +226,29 @@ def test_function_of_the_users_own_may_be_frozen_around_a_trained_integrator(nam
     assert abs(frozen.mean() / plain.mean() - 1) < 0.03
 
 
+@pytest.mark.parametrize("integrator", ["plain_path", "nirc"])
+@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "nvc_lights"])
+def test_light_sampler_inside_a_function_of_the_users_own_says_why_not(sampler, integrator, run_python):
+    """A replay would choose among the lights of the first call; in a process of its own, as it ended the process."""
+    out = run_python(f"""
+import mi_neural, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+from mi_neural import scenes
+scene = mi.load_file(str(scenes.path("lamp_bays")), resx=8, resy=8)
+keys = {{"train_steps": 0, "train_frames": 1, "train_samples": 64}} if {integrator!r} == "nirc" else {{}}
+it = mi.load_dict({{"type": {integrator!r}, "light_sampler": {{"type": {sampler!r}}}, **keys}})
+mi.render(scene, integrator=it, spp=1)
+frame = dr.freeze(lambda scene, it, seed: mi.render(scene, integrator=it, spp=1, seed=seed))
+try:
+    frame(scene, it, mi.UInt32(0))
+except Exception as e:
+    while e.__cause__ is not None:
+        e = e.__cause__
+    print(e)
+""").stdout
+    assert f"{sampler}: inside a function frozen by dr.freeze" in out and "plain_path" in out
+
+
 def test_scenes_loaded_in_a_loop_leave_nothing_behind():
     """200 scenes, sensors and integrators; memory after the first 40 is that at the end, to 3 %."""
     sizes = []
