@@ -15,7 +15,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..estimators import two_level
-from ..render.frozen import undisturbed
 from .blend import where_active
 from .field import Field
 from .incident import IncidentCache, trace_records
@@ -122,13 +121,11 @@ class ControlCache(IncidentCache):
 
     def compare(self, scene, sensor, lights, frames: int) -> float:
         """Gather the statistics of α without training, for a cache that came from elsewhere. Returns the mean α."""
-        compare = self.recorded("compare_frame", sensor)
         value = mi.Float(0)
         with dr.suspend_grad():
             for k in range(frames):
-                with undisturbed():
-                    seed = mi.UInt32(self.random_seed(0x10000000 + k))
-                    value = compare(scene, sensor, lights, self.queried, seed)
+                seed = mi.UInt32(self.random_seed(0x10000000 + k))
+                value = self.call("compare_frame", sensor, scene, sensor, lights, self.queried, seed)
         self.check()
         self._measure = float(value[0])
         return self._measure

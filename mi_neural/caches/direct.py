@@ -117,4 +117,4 @@ class DirectCache(Trainer):
     def train_step(self, scene, sensor, lights) -> None:
         """Trace direct light at fresh points and take one step on it."""
         seed = dr.opaque(mi.UInt32, self.random_seed(self.steps))
-        self.step(self.recorded("frame", sensor), scene, sensor, lights, self.field, self.ages, seed)
+        self.step("frame", sensor, scene, sensor, lights, self.field, self.ages, seed)

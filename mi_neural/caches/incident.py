@@ -17,7 +17,6 @@ import numpy as np
 
 from ..render import path as paths
 from ..render import vertex
-from ..render.frozen import undisturbed
 from ..render.sampling import PathSampler
 from . import encoding, loss
 from .blend import Blend
@@ -244,9 +243,9 @@ class IncidentCache(Trainer):
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
-        with dr.suspend_grad(), undisturbed():
-            probe = self.recorded("probe", sensor)
-            records, _ = probe(scene, sensor, lights, mi.UInt32(self.random_seed(0xFFFFFF)))
+        with dr.suspend_grad():
+            seed = mi.UInt32(self.random_seed(0xFFFFFF))
+            records, _ = self.call("probe", sensor, scene, sensor, lights, seed)
             valid = np.array(records.valid)
             points = np.array(records.position).T[valid]
             target = np.array(records.target).T[valid].mean(axis=-1)
@@ -262,9 +261,8 @@ class IncidentCache(Trainer):
 
     def train_step(self, scene, sensor, lights=None) -> None:
         """Trace fresh records and take one step on them."""
-        step = self.recorded("frame", sensor)
         seed = mi.UInt32(self.random_seed(self.steps))
-        self.step(step, scene, sensor, lights, self.queried, self.ages, seed)
+        self.step("frame", sensor, scene, sensor, lights, self.queried, self.ages, seed)
 
     # -------------------------------------------------------------------------------------------------------------
     # State and files

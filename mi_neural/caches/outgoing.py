@@ -17,7 +17,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render.frozen import undisturbed
 from ..render.sampling import PathSampler
 from ..render.surface import scene_is_glossy, surface_of
 from . import encoding, loss
@@ -476,10 +475,10 @@ class OutgoingCache(IncidentCache):
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
-        with dr.suspend_grad(), undisturbed():
-            probe = self.recorded("probe", sensor)
+        with dr.suspend_grad():
             seed = mi.UInt32(self.random_seed(0xFFFFFF))
-            points, target, valid = (np.array(v) for v in probe(scene, sensor, lights, seed))
+            measured = self.call("probe", sensor, scene, sensor, lights, seed)
+            points, target, valid = (np.array(v) for v in measured)
         box = scene.bbox()
         whole = np.array(box.min).ravel(), np.array(box.max).ravel()
         low, high = encoding.record_box(points.T[valid], *whole)

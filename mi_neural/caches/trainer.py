@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render.frozen import can_freeze, undisturbed
+from ..render.frozen import can_freeze, disturbed, undisturbed
 from .schedule import pace
 from .voxels import Ages
 
@@ -141,6 +141,19 @@ class Trainer:
             self._recorded[name] = dr.freeze(method, auto_opaque=False)
         return self._recorded[name]
 
+    def call(self, name: str, sensor, *args):
+        """Call :meth:`recorded`; the method as it is where it cannot be recorded now."""
+        function = self.recorded(name, sensor)
+        with undisturbed():
+            try:
+                return function(*args)
+            except RuntimeError as e:
+                if function is not self._recorded.get(name) or not disturbed(e):
+                    raise
+                mi.Log(mi.LogLevel.Debug, f"mi_neural: {self.NAME} could not be recorded: {e}")
+                del self._recorded[name]
+                return getattr(self, name)(*args)
+
     def recordings(self) -> dict[str, int]:
         """How often each function was recorded."""
         return {name: function.n_recordings for name, function in self._recorded.items()}
@@ -163,12 +176,12 @@ class Trainer:
         """:func:`~mi_neural.caches.schedule.pace` of this training."""
         return pace(self.training, ages, x, valid, rate_factor, *fields)
 
-    def step(self, function: Callable, *args) -> None:
-        """Queue one step: ``function(*args, rate_factor)``, which returns what :func:`found` makes."""
+    def step(self, name: str, sensor, *args) -> None:
+        """Queue one step: the method `name` with ``(*args, rate_factor)``, which returns what :func:`found` makes."""
         if self._good is None:
             self._good = self.field.snapshot()
-        with dr.resume_grad(), undisturbed():
-            self._unread.append(function(*args, dr.opaque(mi.Float, self.rate_factor)))
+        with dr.resume_grad():
+            self._unread.append(self.call(name, sensor, *args, dr.opaque(mi.Float, self.rate_factor)))
         self.steps += 1
         self.field.steps = self.steps
 

@@ -234,7 +234,7 @@ class VisibilityCache(Trainer):
         with undisturbed():
             points = self._records(scene, sensor, table, groups, seeds)
         for k in range(batch):
-            self.step(self.recorded("frame"), self.field, *_part(points, k, batch), self.ages)
+            self.step("frame", None, self.field, *_part(points, k, batch), self.ages)
 
     def train(self, scene, sensor, table, groups, *, frames: int = 1) -> None:
         """So many steps, each on fresh points."""

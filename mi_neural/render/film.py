@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .frozen import can_freeze, undisturbed
+from .frozen import can_freeze, disturbed, undisturbed
 from .sampling import PathSampler
 from .spectrum import film_colour
 
@@ -223,9 +223,8 @@ class Passes:
             try:
                 return self.recorded[key](*arguments)
             except RuntimeError as e:
-                if not record or "record" not in str(e):
+                if not (record and disturbed(e)):
                     raise
-                # Another thread made or freed something of Mitsuba's meanwhile
                 mi.Log(mi.LogLevel.Debug, f"mi_neural: a pass could not be recorded: {e}")
                 del self.recorded[key]
                 return _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes)(*arguments)

@@ -61,6 +61,12 @@ def _records(function, thing) -> bool:
     return True
 
 
+def disturbed(error: RuntimeError) -> bool:
+    """Whether a recording failed because another thread made or freed something of Mitsuba's meanwhile: then the
+    function can be called as it is."""
+    return "record" in str(error) and not is_recording()
+
+
 def is_recording() -> bool:
     """Whether a function of the user's is being frozen, whose part this call is."""
     return dr.flag(dr.JitFlag.FreezingScope)
