@@ -301,7 +301,7 @@ def of_integrator(facts: SceneFacts, request: Request) -> ScenePlan:
                 decision = given(request.given[name], f"else {decision}: {decision.because}")
             plan.decisions[name] = decision
     for name, size in request.sizes.items():
-        plan.decisions[name] = modelled(size, "the same in all scenes (README: measured)")
+        plan.decisions[name] = modelled(size, "the same in all scenes (mi-neural doc measured)")
         if name in request.given:
             plan.decisions[name] = given(request.given[name], f"else {size}")
     return plan
@@ -385,7 +385,7 @@ def _environment(facts: SceneFacts, request: Request) -> Decision:
         return given(cells, "there is an environment")
     if request.everything:
         return modelled(EVERY_CELL, "everything; there is an environment")
-    return left_out("visibility by direction costs what it saves (README)")
+    return left_out("visibility by direction costs what it saves (mi-neural doc measured)")
 
 
 def _reliability(request: Request) -> Decision:

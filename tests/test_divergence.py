@@ -117,7 +117,7 @@ def test_rate_a_hundred_times_too_high_is_recovered_from_within_twenty_steps(kin
         print(f"{kind}: {run.recoveries} recoveries, the last at step {latest}; error {found[-1]:.4f}, healthy "
               f"{healthy_error:.4f}")  # fmt: skip
         assert 1 <= run.recoveries and latest < 20
-    assert np.median(found) <= 2 * healthy_error
+    assert np.median(found) <= 2.5 * healthy_error
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=SLOW) for k in KINDS])

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mi_neural.image.moments import Accumulator
+from mi_neural.image.moments import Accumulator, ErrorEstimate, Groups
 
 from .load import split_channels
 
@@ -284,6 +284,36 @@ def render_seconds(
     finally:
         run.plan(None)
     return run.result()
+
+
+def render_until(
+    scene, integrator, error: float, seconds: float | None = None, seed: int = 0, sensor: int = 0,
+    progress: Progress | None = None, keep: Callable[[Rendered], None] | None = None,
+) -> tuple[Rendered, ErrorEstimate | None]:  # fmt: skip
+    """Render until the estimated trimmed relMSE is at most `error`, or for `seconds` if that comes first. Returns the
+    image and the estimate, which knows of noise and not of bias (:class:`~mi_neural.image.moments.Groups`).
+
+    An eighth of the samples so far at most is rendered between two looks, and no more than the error asks for.
+    """
+    start, film, estimate = clock(), Groups(), None
+    run = _Run(scene, integrator, seed, sensor, keep, 0, film)
+    sizes = pass_sizes(scene, sensor)
+    try:
+        while seconds is None or clock() - start < seconds:
+            needed = film.spp * (estimate.value / error) if estimate else 4
+            if estimate and estimate.value <= error:
+                break
+            most = max(1, min(film.spp // 8, round(needed) - film.spp))
+            run.plan(max(round(needed), film.spp + 1))
+            run.one_pass(max(s for s in sizes if s <= most))
+            estimate = film.error()
+            if progress and estimate:
+                progress(min(error / max(estimate.value, 1e-30), 1.0), 1.0)
+    except KeyboardInterrupt:
+        run.interrupted = True
+    finally:
+        run.plan(None)
+    return run.result(), estimate
 
 
 def choose_pass(sizes: list[int], times: dict[int, float], remaining: float) -> int | None:

@@ -12,7 +12,7 @@ from mi_neural.bench import benchmark, budget, cluster, denoise, environment, jo
 from mi_neural.bench import reference as references
 from mi_neural.bench.load import InputError
 from mi_neural.commands import options
-from mi_neural.image import exr
+from mi_neural.image import exr, moments
 
 #: Seconds of training after which `render` writes a first image of one sample a pixel, to be replaced by the final one.
 PREVIEW_SECONDS = 1.0
@@ -30,6 +30,10 @@ def render(
     spp: Annotated[int | None, typer.Option(help="samples a pixel; default: what the scene says")] = None,
     seconds: Annotated[
         float | None, typer.Option(help="wall time instead of samples, training included, compiling not")
+    ] = None,
+    until_error: Annotated[
+        float | None,
+        typer.Option(metavar="E", help="until the estimated trimmed relMSE, of noise alone, is E; at most --seconds"),
     ] = None,
     pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before the clock starts")] = 0,
     size: options.Size = None,
@@ -56,6 +60,9 @@ def render(
         raise InputError("--seconds is time of this process; with --scheduler give --spp")
     terminal.positive("--spp", spp)
     terminal.positive("--seconds", seconds)
+    terminal.positive("--until-error", until_error)
+    if until_error is not None and (spp is not None or scheduler is not None):
+        raise InputError("--until-error chooses the samples itself: leave out --spp and --scheduler")
     if pretrain < 0:
         raise InputError(f"--pretrain takes a number of frames from 0, got {pretrain}")
     wanted_size, keys, parameters = (
@@ -88,7 +95,7 @@ def render(
         terminal.announce(note)
     terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
-    seconds_pretrain, seconds_preview, first_image = 0.0, 0.0, None
+    seconds_pretrain, seconds_preview, first_image, estimate = 0.0, 0.0, None, None
 
     def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
         row = benchmark.make_row(
@@ -129,7 +136,8 @@ def render(
         n = spp or loaded.default_spp
         if workers is None:
             bars("compiling")
-            sizes = budget.pass_sizes(loaded.scene) if seconds else sorted(set(budget.plan_passes(loaded.scene, n)))
+            by_clock = seconds or until_error
+            sizes = budget.pass_sizes(loaded.scene) if by_clock else sorted(set(budget.plan_passes(loaded.scene, n)))
             if seconds is None and not hasattr(case.integrator, "prepare"):
                 sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
             case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
@@ -140,12 +148,17 @@ def render(
         bars_pretrain = bars(f"training {pretrain} frames") if pretrain else None
         seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
         seconds_first = 0.0
-        if seconds is None and not stopped:
+        if (seconds is None or until_error) and not stopped:
             bars_first = previewed(bars("training")) if hasattr(case.integrator, "train_first") else None
             seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
         if stopped:  # the image that can be had at once
             rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
             rendered.interrupted = True
+        elif until_error is not None:
+            bar = bars(f"rendering until the error is {until_error:g}")
+            rendered, estimate = budget.render_until(
+                loaded.scene, case.integrator, until_error, seconds, seed, progress=bar, keep=keep
+            )
         elif seconds is not None:
             rendered = budget.render_seconds(
                 loaded.scene,
@@ -181,6 +194,12 @@ def render(
     terminal.print_rows(repeats.group([row]))
     first = f"first image {row.seconds_to_first_image:.1f} s after the start"
     terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
+    if estimate is not None:
+        terminal.out.print(
+            f"estimated trimmed relMSE {estimate.value:.3g} ({100 * moments.CONFIDENCE:.0f} % interval "
+            f"{estimate.low:.3g} to {estimate.high:.3g}), of the noise alone, at {rendered.spp} samples a pixel",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
     if rendered.problem:
         raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {n} samples a pixel")
     if rendered.interrupted:

@@ -111,6 +111,12 @@ def relmse_trimmed(image: np.ndarray, reference: np.ndarray, variance: np.ndarra
     return max(0.0, float((raw[kept] - noise[kept]).mean()))
 
 
+def relative_weights(brightness: np.ndarray) -> np.ndarray:
+    """What relMSE multiplies squared errors with, by the luminance of the reference; same shape."""
+    scale = 1.0 / brightness.mean() if brightness.mean() > 0.0 else 1.0
+    return scale**2 / ((scale * brightness) ** 2 + RELMSE_EPSILON)
+
+
 def relative_squared_errors(
     image: np.ndarray, reference: np.ndarray, variance: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -119,9 +125,7 @@ def relative_squared_errors(
     Two arrays of shape (height, width, 3); the second is 0 without a `variance`.
     """
     image, reference = _checked_pair(image, reference)
-    lum = luminance(reference)
-    scale = 1.0 / lum.mean() if lum.mean() > 0.0 else 1.0
-    weight = scale**2 / ((scale * lum) ** 2 + RELMSE_EPSILON)[..., None]
+    weight = relative_weights(luminance(reference))[..., None]
 
     if variance is None:
         variance = np.zeros_like(reference)

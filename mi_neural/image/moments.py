@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+
+from . import metrics
 
 
 class Accumulator:
@@ -91,3 +95,74 @@ class Moments(Accumulator):
             return None
         scale = np.maximum(self.n_passes - 1.0, 1.0) * np.maximum(self.weight, 1.0)
         return np.where(self.n_passes > 1, self.squares / scale, np.inf).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """Trimmed relMSE of an image against the limit of ever more samples, estimated from its own noise; and the ends of
+    an interval of confidence `CONFIDENCE`. A bias is not in it."""
+
+    value: float
+    low: float
+    high: float
+
+
+#: Of the interval of an :class:`ErrorEstimate`.
+CONFIDENCE = 0.9
+
+
+class Groups(Accumulator):
+    """Sample-weighted mean of passes, kept in groups of neighbouring passes whose spread says how noisy the mean is.
+
+    With G groups of n_g samples each, N in all, ``Σ n_g (x_g - mean)² / ((G - 1) N)`` is the variance of the mean of a
+    pixel, without bias. Each group's share of the sum over all pixels is one sample of the image's error; their spread
+    gives the interval for the error of this image (Student).
+    """
+
+    #: Most groups; twice as many are merged in pairs.
+    MOST = 16
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.groups: list[tuple[np.ndarray, int]] = []
+
+    def add(self, image: np.ndarray, spp: int) -> None:
+        super().add(image, spp)
+        image = np.where(np.isfinite(image).all(axis=-1, keepdims=True), image, 0.0)[..., :3].astype(np.float32)
+        self.groups.append((image, spp))
+        if len(self.groups) >= 2 * self.MOST:
+            pairs = zip(self.groups[::2], self.groups[1::2], strict=True)
+            self.groups = [((a * n + b * m) / (n + m), n + m) for (a, n), (b, m) in pairs]
+
+    def replace(self, image: np.ndarray, spp: int) -> None:
+        raise TypeError("the spread of passes cannot be taken from an image that stands for all of them")
+
+    def error(self) -> ErrorEstimate | None:
+        """The estimate; None after fewer than four groups."""
+        if len(self.groups) < 4:
+            return None
+        mean = self.mean()[..., :3].astype(np.float64)
+        # The noise of a group must not choose its own weight: the others do
+        whole = sum(n * image.astype(np.float64) for image, n in self.groups)
+        squares = []
+        for image, n in self.groups:
+            others = (whole - n * image) / max(self.spp - n, 1)
+            squares.append(n * (image - mean) ** 2 * metrics.relative_weights(metrics.luminance(others))[..., None])
+        total = sum(squares)
+        kept = total <= np.quantile(total, 1 - metrics.TRIM_FRACTION)
+        each = np.array([s[kept].sum() / kept.size for s in squares])
+        G, N = len(each), self.spp
+        # 1 / m² of a noisy m is too large by three times its relative variance
+        brightness = metrics.luminance(mean)
+        spread = sum(n * (metrics.luminance(image) - brightness) ** 2 for image, n in self.groups)
+        each /= 1 + 3 * (spread * metrics.relative_weights(brightness)).mean() / ((G - 1) * N)
+        value = each.sum() / ((G - 1) * N)
+        # The error of this very image is one more such sample, and not their mean
+        half = _student(G - 1) * each.std(ddof=1) * np.sqrt(1 + G / (G - 1) ** 2) / N
+        return ErrorEstimate(float(value), float(max(value - half, 0.0)), float(value + half))
+
+
+def _student(n: int, z: float = 1.6449) -> float:
+    """95 % quantile of Student's t with n degrees of freedom, by its expansion around the normal one, `z`: within 2 %
+    from n = 3 on."""
+    return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
