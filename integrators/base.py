@@ -107,7 +107,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         spp = spp or sensor.sampler().sample_count()
         with LOCK, dr.suspend_grad():
             self.bind(scene, sensor)
-            block = self._render(scene, sensor, _seed(seed), spp)
+            block = self._render(scene, sensor, as_seed(seed), spp)
             film = sensor.film()
             film.prepare(self.aov_names())
             film.put_block(block)
@@ -162,7 +162,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         samples of each pixel up, whatever the film's filter.
         """
         numbers = (first_sample, sizes[1], first_row, sizes[0])
-        samples = Samples(_seed(seed), *(dr.opaque(mi.UInt32, v) for v in numbers))
+        samples = Samples(as_seed(seed), *(dr.opaque(mi.UInt32, v) for v in numbers))
         if settings is None:
             settings = self.settings(self.planned_spp or total or sizes[1])
         keys = tuple((k, v) for k, v in vars(self).items() if isinstance(v, (bool, int, float, str)))
@@ -247,7 +247,7 @@ class _FilmState:
         return s
 
 
-def _seed(seed):
+def as_seed(seed):
     """A seed as a variable, from a number or a variable."""
     return mi.UInt32(seed) if dr.is_jit_v(seed) else dr.opaque(mi.UInt32, int(seed) & 0xFFFFFFFF)
 

@@ -17,13 +17,13 @@ from mi_neural.caches.field import CacheFileError, FieldShape
 from mi_neural.caches.files import damaged
 from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.caches.reliability import MEASURES, Reliability
-from mi_neural.integrators import planning
-from mi_neural.integrators.base import FilmIntegrator, refuse_gradients
+from mi_neural.integrators import gradients, planning
+from mi_neural.integrators.base import FilmIntegrator, as_seed
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
-from mi_neural.render.frozen import undisturbed
+from mi_neural.render.frozen import LOCK, undisturbed
 from mi_neural.render.sampling import PathSampler
 
 #: Frames that `train_frames = -1` trains at least and at most.
@@ -65,7 +65,14 @@ class _State:
         self.measured: dict = {}  # of the scene
         self.plan: plan.ScenePlan | None = None  # of the scene that was rendered last
         self.bound = BoundScene()
+        self.said: set[str] = set()
         self.reset()
+
+    def say_once(self, text: str) -> None:
+        """Warn of something that holds from now on."""
+        if text not in self.said:
+            self.said.add(text)
+            mi.Log(mi.LogLevel.Warn, f"mi_neural: {text}")
 
     def reset(self) -> None:
         self.signature = None
@@ -86,6 +93,8 @@ class CacheIntegrator(FilmIntegrator):
     PIXEL_BYTES = 4 * FILM_VALUES
     #: Training paths of a step where no key says it.
     TRAIN_SAMPLES = Training.n_paths
+    #: Where gradients come from if no key says it.
+    GRADIENT = "cache"
     #: Whether the plan may choose a light sampler where none is nested.
     CHOOSES_LIGHTS = False
 
@@ -95,6 +104,9 @@ class CacheIntegrator(FilmIntegrator):
         self.train_steps = props.get("train_steps", 1)
         self.freeze_cache = props.get("freeze_cache", False)
         self.seed = props.get("seed", 0)
+        self.gradient = props.get("gradient", self.GRADIENT)
+        self._check(self.gradient in gradients.GRADIENTS,
+                    f"gradient is '{self.gradient}'; give one of: {', '.join(gradients.GRADIENTS)}")  # fmt: skip
         self._check(self.train_frames >= -1, f"train_frames is {self.train_frames}; give -1 (until settled), 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
@@ -448,7 +460,50 @@ class CacheIntegrator(FilmIntegrator):
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
 
-    render_backward = render_forward = refuse_gradients
+    def incident_radiance(self, scene, field, path, found, after, sampler):
+        """Radiance, emission apart, that the ray of a bounce brings from `after` to `path`, by the cache; not
+        differentiated: (Li, sampler)."""
+        return gradients.by_incident_cache(self, scene, field, path, found, after, sampler)
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        """The image's derivative along the gradients that `params` have, by the method of the key ``gradient``."""
+        sensor = self._checked(scene, sensor, spp)
+        with LOCK, dr.suspend_grad():
+            if self._differentiates_by_cache(scene, params, sensor):
+                return gradients.forward(self, scene, sensor, as_seed(seed), spp or sensor.sampler().sample_count())
+            image = gradients.prb_of(self).render_forward(scene, params, sensor, seed, spp)
+            missing = dr.zeros(mi.TensorXf, (*image.shape[:2], len(self.aov_names())))
+            return dr.concat([image, missing], axis=2) if self.channels else image
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        """Carry `grad_in`, derivatives with respect to the image, to the parameters, by the method of ``gradient``."""
+        sensor = self._checked(scene, sensor, spp)
+        with LOCK, dr.suspend_grad():
+            if self._differentiates_by_cache(scene, params, sensor):
+                spp = spp or sensor.sampler().sample_count()
+                gradients.backward(self, scene, grad_in, sensor, as_seed(seed), spp)
+                return
+            if self.channels:
+                grad_in = grad_in[:, :, : grad_in.shape[2] - len(self.aov_names())]
+            gradients.prb_of(self).render_backward(scene, params, grad_in, sensor, seed, spp)
+
+    def _differentiates_by_cache(self, scene, params, sensor) -> bool:
+        """Whether derivatives come from the cache. What stands against it, or is left out, is said once."""
+        if self.channels:
+            self.state.say_once(f"{self.plugin}: the channels {', '.join(self.channels)} have no gradient")
+        if self.gradient == "prb":
+            return False
+        with dr.resume_grad():
+            moving = gradients.moved(scene, params)
+        if moving:
+            self.state.say_once(
+                f"{self.plugin}: gradients come from prb, because the cache has none of shapes and sensors: "
+                f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
+            )
+            return False
+        if not self.state.bound.knows(scene) or (self.needs_cache and self.cache.field is None):
+            self.bind(scene, sensor)
+        return self.needs_cache
 
     def rendered(self, spp: int) -> None:
         self._publish()

@@ -118,6 +118,12 @@ SHARED_KEYS = (
      * - freeze_cache
        - |bool|
        - Do not train at all; an untrained cache answers with a constant. (Default: false)
+     * - gradient
+       - |string|
+       - Where derivatives of images come from, as in ``dr.backward(mi.render(scene, params, integrator=...))``.
+         ``cache``: paths that read the incident radiance at each vertex from the cache: little noise, as much bias as
+         the cache has. ``prb``: Mitsuba's ``prb`` with the same ``max_depth``, ``rr_depth`` and ``hide_emitters``:
+         unbiased. Shapes and sensors always take the latter. (Default: cache; in ``nirc_two_level`` prb)
      * - seed
        - |int|
        - Of the initial weights and the training paths. (Default: 0)

@@ -15,6 +15,7 @@ from mi_neural.caches.outgoing import OutgoingCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.estimators import spread
+from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators.common import CacheIntegrator
 from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.planning import SIZES
@@ -26,9 +27,6 @@ from mi_neural.render.sampling import PathSampler
 #: Caches of incident radiance without a network
 CONTROLS = {"spatial_hash": SpatialHashCache, "sh_grid": HarmonicCache}
 TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
-#: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
-#: the cache's directional detail does not suffice for it.
-SHARP_PDF = 3.0
 #: Dimensions of the stratified numbers of cache samples
 EXTRA, EXTRA_LOBE = range(paths.FREE, paths.FREE + 2)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_neural.caches.control import ControlCache
 from mi_neural.estimators import two_level
+from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators import pilot, progressive
 from mi_neural.integrators.common import CacheIntegrator
 from mi_neural.integrators.keys import SHARED_KEYS, register
@@ -20,8 +21,6 @@ from mi_neural.render import path as paths
 from mi_neural.render import vertex
 
 MODES = ("unbiased", "progressive")
-#: A lobe that sends a sample with a density above this (per steradian) is always traced, and never by the cache.
-SHARP_PDF = 3.0
 #: Share of the scene's mean radiance that RIS grants every direction, so that light unknown to the cache is found.
 DEFENSIVE = 0.25
 #: Queries per vertex with `every_vertex`: the direction that is followed, and another.
@@ -33,6 +32,8 @@ TOGETHER = 16
 
 
 class NIRCTwoLevelIntegrator(CacheIntegrator):
+    GRADIENT = "prb"
+
     def __init__(self, props):
         self.choice, self.mixed, self.compiling = None, None, False
         super().__init__(props)

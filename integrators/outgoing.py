@@ -9,6 +9,7 @@ import mitsuba as mi
 from mi_neural import plan
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.integrators import gradients
 from mi_neural.integrators.common import CacheIntegrator
 
 #: The constants of a training step in the words of the plugins' keys
@@ -85,6 +86,10 @@ class OutgoingIntegrator(CacheIntegrator):
         return super().needs_cache and math.isfinite(self.spread_threshold)
 
     # -------------------------------------------------------------------------------------------------------------
+
+    def incident_radiance(self, scene, field, path, found, after, sampler):
+        field = getattr(field, "outgoing", field)
+        return gradients.by_outgoing_cache(self, scene, field, self.content, after, sampler)
 
     PROBES = 1
 

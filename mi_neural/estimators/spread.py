@@ -10,6 +10,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+#: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
+#: the directional detail of a cache of incident radiance does not suffice for it.
+SHARP_PDF = 3.0
+
 
 def camera_spread(distance_squared, cos_theta):
     """Footprint ``a_0 = |x_0-x_1|² / (4π |cos θ_1|)`` of a pixel's ray at the first vertex, in squared scene units."""

@@ -182,10 +182,14 @@ def bounce(
     return found, sampler
 
 
-def direct_light(scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None):
+def direct_light(
+    scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None, attached: bool = False
+):  # fmt: skip
     """Both halves of direct light at a vertex: (next-event estimation, emission that the BSDF ray met, sampler).
 
-    They are weighted against each other, so that ``E[first + f/p second] = ∫ f Le cos dω``.
+    They are weighted against each other, so that ``E[first + f/p second] = ∫ f Le cos dω``. `attached`: both have
+    derivatives with respect to BSDFs and emitters, inside of ``dr.suspend_grad()`` too, where directions and weights
+    have none; `lights` must be None.
     """
     si, active, delta = path.si, path.active, found.delta
     smooth = active & vertex.has_smooth(bsdf)
@@ -209,7 +213,12 @@ def direct_light(scene, lights, path: PathState, bsdf, found: Bounce, numbers: N
         pdf_hit = choice.pmf_hit * table.pdf(scene, si, hit, found.si, ds_hit, emits & ~delta)
 
     # ------------------ Both techniques, weighted against each other -------------------------
-    f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), sampled)
+    with dr.resume_grad(when=attached):
+        f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), sampled)
+        if attached:
+            emitted = scene.eval_emitter_direction(si, ds, sampled)
+            light = dr.replace_grad(light, emitted * dr.select(sampled, dr.rcp(ds.pdf), 0))
+    pdf_bsdf = dr.detach(pdf_bsdf)
     if lights is not None:  # the scene has traced its shadow ray already
         sampled &= dr.max(f * light) > 0
         sampled &= ~scene.ray_test(si.spawn_ray_to(ds.p), sampled)
@@ -217,12 +226,14 @@ def direct_light(scene, lights, path: PathState, bsdf, found: Bounce, numbers: N
     if alone is not None:
         in_full |= alone(pdf_bsdf)
     w_light = dr.select(in_full, 1, mis_weight(pdf_light, pdf_bsdf))
-    L_nee = vertex.finite(f * light * w_light, sampled)
+    with dr.resume_grad(when=attached):
+        L_nee = vertex.finite(f * light * w_light, sampled)
 
     w_bsdf = dr.select(delta, 1, mis_weight(found.bs.pdf, pdf_hit))
     # What an emitter says that is not finite is seen and counted by the film, and by the training records
-    Le = found.si.emitter(scene, emits).eval(found.si, emits)
-    return L_nee, dr.select(emits, Le * w_bsdf, 0), sampler
+    with dr.resume_grad(when=attached):
+        Le = dr.select(emits, found.si.emitter(scene, emits).eval(found.si, emits) * w_bsdf, 0)
+    return L_nee, Le, sampler
 
 
 def emission_alone(scene, lights, path, bsdf, found: Bounce, numbers, sampler, alone=None):

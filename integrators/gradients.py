@@ -1,0 +1,272 @@
+"""Derivatives of images with respect to their scene: along adjoint paths that read incident radiance from a cache, or
+by Mitsuba's ``prb``.
+
+The derivative of the rendering equation has two terms (Vicini, Speierer and Jakob 2021, "Path Replay Backpropagation",
+eq. 5, after Nimier-David et al. 2020, "Radiative Backpropagation", eq. 4):
+
+    dL_o = dL_e + ∫ df L_i cos dω + ∫ f dL_i cos dω.
+
+The last one is the derivative at the next vertex of a path, times the throughput. The first ones need the radiance L_i
+at each vertex but not its derivative. Path replay traces it: all that lies further along the path, found by a first
+pass. Here its emission is traced, and the rest is what the cache answers, so that one pass suffices and the derivative
+at a vertex does not have the noise of the vertices behind it. E[derivative] is right if the cache is.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import replace
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.estimators.spread import SHARP_PDF
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+from mi_neural.render.film import PACKET, PASS_SAMPLES, Area, Samples, camera_rays
+from mi_neural.render.frozen import can_freeze, is_recording, undisturbed
+from mi_neural.render.surface import scene_is_glossy, surface_of
+
+#: Values of the key ``gradient``.
+GRADIENTS = ("cache", "prb")
+#: Of the random numbers of adjoint paths, which are not those of the image.
+SALT = 0x3C6EF372
+
+
+def moved(scene, params) -> list[str]:
+    """Names of the shapes' and sensors' parameters that derivatives are wanted of: positions, normals, transforms."""
+    if not isinstance(params, mi.SceneParameters):
+        params = mi.traverse(scene)
+    names = []
+    for key, (_, _, owner, *_) in params.properties.items():
+        value = params[key] if isinstance(owner, mi.Shape | mi.Sensor) else None
+        if value is not None and dr.grad_enabled(value) and not _is_attribute(key):
+            names.append(key)
+    return names
+
+
+def _is_attribute(key: str) -> bool:
+    """Whether a mesh's parameter is an attribute that textures show."""
+    name = key.rpartition(".")[2]
+    fixed = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+    return name.startswith(("vertex_", "face_")) and name not in fixed
+
+
+def prb_of(integrator):
+    """Mitsuba's ``prb`` with the limits of `integrator`."""
+    return mi.load_dict({
+        "type": "prb", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth,
+        "hide_emitters": integrator.hide,
+    })  # fmt: skip
+
+
+# -----------------------------------------------------------------------------------------------------------------
+# From an image to its camera samples and back
+
+
+def backward(integrator, scene, grad_in, sensor, seed, spp: int) -> None:
+    """Add `grad_in` times the image's derivatives to the gradients of the scene's parameters.
+
+    `grad_in`: a tensor of the image's shape. `seed`: a ``mi.UInt32``. `spp`: samples a pixel.
+    """
+    area = Area.of(sensor)
+    for first, n in _passes(area, spp):
+        samples, n_lanes = _samples(area, seed, first, n)
+        place, active = _places(area, samples, n_lanes)
+        with dr.resume_grad():
+            δL = dr.zeros(mi.Spectrum, n_lanes)
+            dr.enable_grad(δL)
+            image = _image(integrator, sensor, [(place, δL, active)])
+            dr.set_grad(image, grad_in * (n / spp))
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            δL = dr.grad(δL)
+        dr.eval(δL)
+        _trace_pass(integrator, dr.ADMode.Backward, scene, sensor, area, samples, n_lanes, δL)
+        dr.eval()
+
+
+def forward(integrator, scene, sensor, seed, spp: int):
+    """The image's derivative along the gradients that the scene's parameters have; a tensor of the image's shape."""
+    area, parts = Area.of(sensor), []
+    for first, n in _passes(area, spp):
+        samples, n_lanes = _samples(area, seed, first, n)
+        place, active = _places(area, samples, n_lanes)
+        δL = _trace_pass(integrator, dr.ADMode.Forward, scene, sensor, area, samples, n_lanes, None)
+        dr.eval(place, δL, active)
+        parts.append((place, δL, active))
+    return _image(integrator, sensor, parts)
+
+
+def _passes(area: Area, spp: int):
+    """(first sample, number of samples a pixel) of passes that fit memory."""
+    most = max(1, PASS_SAMPLES // area.n_pixels)
+    return [(first, min(most, spp - first)) for first in range(0, spp, most)]
+
+
+def _samples(area: Area, seed, first: int, n: int) -> tuple:
+    """(:class:`Samples` of a pass, its number of lanes)."""
+    numbers = (dr.opaque(mi.UInt32, v) for v in (first, n, 0, area.height))
+    return Samples(seed, *numbers), -(-area.n_pixels // PACKET) * PACKET * n
+
+
+def _places(area: Area, samples: Samples, n_lanes: int) -> tuple:
+    """Where the camera samples of a pass lie on the film, with a box filter in the middle of their pixels, and which
+    of them exist."""
+    pixel, sample, active = samples.lanes(area, n_lanes)
+    within = mi.Point2f(0.5) if area.box else samples.sampler(pixel, sample, SALT).stratified_2d(0)
+    return area.corner(pixel) + within + mi.Point2f(*(float(v) for v in area.offset)), active
+
+
+def _image(integrator, sensor, parts: list):
+    """What the film makes of camera samples (place, radiance, active); its other channels are 0."""
+    film, others = sensor.film(), integrator.aov_names()
+    film.prepare(others)
+    block = film.create_block()
+    block.set_coalesce(False)
+    for place, L, active in parts:
+        alpha = [mi.Float(0)] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+        block.put(place, [L.x, L.y, L.z, *alpha, mi.Float(1), *(mi.Float(0) for _ in others)], active)
+    film.put_block(block)
+    return film.develop()
+
+
+def _trace_pass(integrator, mode, scene, sensor, area: Area, samples: Samples, n_lanes: int, δL):
+    """Adjoint paths of one pass, by a recorded function where that is possible; their derivatives in forward mode."""
+    held = weakref.ref(integrator)  # or a recording would keep the integrator alive
+
+    def trace_pass(scene, sensor, field, samples, δL):
+        pixel, sample, active = samples.lanes(area, n_lanes)
+        ray, weight, _, sampler = camera_rays(sensor, area, pixel, samples.sampler(pixel, sample, SALT))
+        δL = dr.zeros(mi.Spectrum, n_lanes) if δL is None else δL * weight
+        ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
+        δL = adjoint(held(), mode, scene, field, sampler, ray, δL, active)
+        return δL * weight if mode == dr.ADMode.Forward else None
+
+    arguments = scene, sensor, integrator.bound_field, samples, δL
+    state = integrator.film_state
+    records = mode == dr.ADMode.Backward and integrator.records and not is_recording()
+    if not (records and state.scene_records(scene) and can_freeze(sensor)):
+        return trace_pass(*arguments)
+    limits = integrator.max_depth, integrator.rr_depth, integrator.hide
+    key = ("adjoint", area, n_lanes, sensor.class_name(), *limits)
+    recorded = state.passes.recorded.setdefault(key, dr.freeze(trace_pass))
+    with undisturbed():
+        return recorded(*arguments)
+
+
+# -----------------------------------------------------------------------------------------------------------------
+# Along a path
+
+
+def adjoint(integrator, mode, scene, field, sampler, ray, δL, active):
+    """Carry derivatives along camera paths: in backward mode `δL`, that of the radiance of each path, to the scene's
+    parameters; in forward mode theirs to the radiance, which is returned.
+
+    At a vertex of throughput β, the BSDF sampled with density p, NEE being next-event estimation,
+
+        dL += β d[NEE + f/p (w L_e + L_i)],
+
+    with L_i from ``integrator.incident_radiance``; L_i, β, p, directions and MIS weights w are detached.
+    """
+    with dr.resume_grad():
+        path = paths.camera_vertex(integrator, scene, mi.Ray3f(dr.detach(ray)), active)
+        δL = _carry(mode, path.L, δL)
+    path.L = dr.zeros(mi.Spectrum, dr.width(ray))
+    numbers_first = paths.stratified(sampler)
+
+    def step(path, δL, sampler):
+        si, bsdf = path.si, path.si.bsdf(path.ray)
+        numbers, sampler = paths.draw_numbers(sampler)
+        numbers = dr.select(path.depth == 1, numbers_first, numbers)
+        found, sampler = paths.bounce(
+            scene, None, path, sampler, numbers, bsdf=bsdf, direct=partial(paths.direct_light, attached=True)
+        )
+        L_nee, Le = found.L_nee, found.Le
+        found.L_nee, found.Le = mi.Spectrum(0), mi.Spectrum(0)
+        after = paths.advance(path, found, integrator.depth_limit)
+
+        Li, sampler = integrator.incident_radiance(scene, field, path, found, after, sampler)
+        per_pdf = dr.select(found.followed & (found.bs.pdf > 0), dr.rcp(found.bs.pdf), 0)
+        with dr.resume_grad():
+            f = bsdf.eval(mi.BSDFContext(), si, found.bs.wo, found.followed)
+            weight = dr.replace_grad(found.weight, f * per_pdf)
+            Lo = dr.select(path.active, path.β * (L_nee + weight * (Le + Li)), 0)
+            δL = _carry(mode, Lo, δL)
+        after, sampler = paths.roulette(after, sampler, integrator.rr_depth)
+        return after, δL, sampler
+
+    return dr.while_loop(
+        (path, δL, sampler), lambda path, δL, sampler: path.active, step, label=f"adjoint path ({mode.name})"
+    )[1]
+
+
+def _carry(mode, L, δL):
+    """Carry derivatives between radiance `L` and the parameters that it depends on: `δL`, in forward mode with those
+    of `L` added."""
+    if not dr.grad_enabled(L):
+        return δL
+    if mode == dr.ADMode.Forward:
+        return δL + dr.forward_to(L)
+    dr.backward_from(δL * L)
+    return δL
+
+
+def by_incident_cache(integrator, scene, field, path, found, after, sampler):
+    """Radiance, emission apart, that the ray of a bounce brings to `path`, from a cache of incident radiance:
+    (Li, sampler).
+
+    Where the ray follows a lobe that is sharper than the cache, direct light is traced at what it met, and so on until
+    a lobe is not. Nothing is read for mirrors, whose BSDFs have no derivative under detached sampling.
+    """
+    smooth = after.active & ~found.delta
+    near = smooth & (found.bs.pdf <= SHARP_PDF)
+    Li = field.query(field.encode(path.si.p, vertex.facing(path.si)), found.ray.d)
+    Li = dr.select(near, Li, 0)
+    if not scene_is_glossy(scene):
+        return Li, sampler
+
+    def step(path, sampler):
+        found, sampler = paths.bounce(scene, None, path, sampler)
+        after = paths.advance(path, found, integrator.depth_limit)
+        ends = vertex.is_terminal(path.si, path.active) & ~found.delta & (found.bs.pdf <= SHARP_PDF)
+        beyond = field.query(field.encode(path.si.p, vertex.facing(path.si)), found.ray.d)
+        after.L += dr.select(ends & after.active, path.β * found.weight * beyond, 0)
+        after.active &= ~ends
+        return paths.roulette(after, sampler, integrator.rr_depth)
+
+    path = replace(after, L=mi.Spectrum(0), β=mi.Spectrum(1), η=mi.Float(1), active=smooth & ~near)
+    path, sampler = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="sharp lobes")
+    return Li + path.L, sampler
+
+
+def by_outgoing_cache(integrator, scene, field, content: str, after, sampler):
+    """The same from a cache of outgoing radiance, which is read where the ray arrived, at `after`.
+
+    Mirrors, glass and masks are traced on to the first surface that the cache knows; so is direct light there if the
+    `content` of the cache is ``indirect``.
+    """
+    path = replace(after, L=mi.Spectrum(0), β=mi.Spectrum(1), η=mi.Float(1))
+
+    def step(path, sampler):
+        found, sampler = paths.bounce(scene, None, path, sampler)
+        path = paths.advance(path, found, integrator.depth_limit)
+        return paths.roulette(path, sampler, integrator.rr_depth)
+
+    def passes_on(path, sampler):
+        return path.active & ~vertex.is_terminal(path.si, path.active)
+
+    if paths.scene_has_mirrors(scene) or _scene_has_masks(scene):
+        path, sampler = dr.while_loop((path, sampler), passes_on, step, label="mirrors and masks")
+    if content == "indirect":
+        found, sampler = paths.bounce(scene, None, path, sampler)
+        path.L += dr.select(path.active, path.β * found.direct, 0)
+    bsdf = path.si.bsdf(path.ray)
+    surface = surface_of(path.si, bsdf, path.active, scene_is_glossy(scene))
+    return path.L + dr.select(path.active, path.β * field.query(*surface.inputs()), 0), sampler
+
+
+def _scene_has_masks(scene) -> bool:
+    bsdfs = [s.bsdf() for s in scene.shapes()]
+    return any(b is not None and bool(int(b.flags()) & int(mi.BSDFFlags.Null)) for b in bsdfs)

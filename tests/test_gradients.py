@@ -1,0 +1,374 @@
+"""Gradients of images through the cached integrators: against analysis, finite differences, and Mitsuba's ``prb``.
+
+Biased gradients may be off by 5 % of the gradient's norm beyond what noise explains.
+"""
+
+import importlib
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_neural import scenes
+
+T = mi.ScalarTransform4f
+SMALL = {"train_frames": 96, "train_samples": 1024}
+CACHED = ("nirc", "nrc", "neural_path", "nirc_two_level")
+BY_CACHE = ("nirc", "nrc", "neural_path")
+
+
+def wall(at, axis, angle, bsdf, size=1.0, **keys):
+    return {"type": "rectangle", "to_world": T().translate(at).rotate(axis, angle).scale(size), "bsdf": bsdf, **keys}
+
+
+def colour(*rgb):
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
+
+
+def picture(n=4, low=0.2, high=0.8, seed=0):
+    values = np.random.default_rng(seed).uniform(low, high, (n, n, 3)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "filter_type": "nearest"}
+
+
+def room(block=None, width=12, **more):
+    """A room with a picture on its floor, an open front, a lamp and a small sun inside of it."""
+    eye = {"type": "perspective", "fov": 45, "to_world": T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]),
+           "film": {"type": "hdrfilm", "width": width, "height": width, "rfilter": {"type": "box"},
+                    "pixel_format": "rgb"}}  # fmt: skip
+    return mi.load_dict({
+        "type": "scene", "eye": eye, "back": wall([0, 0, -1], [0, 1, 0], 0, colour(0.6, 0.6, 0.6)),
+        "floor": wall([0, -1, 0], [1, 0, 0], -90, {"type": "diffuse", "reflectance": picture()}),
+        "ceiling": wall([0, 1, 0], [1, 0, 0], 90, colour(0.7, 0.7, 0.7)),
+        "left": wall([-1, 0, 0], [0, 1, 0], 90, colour(0.7, 0.1, 0.1)),
+        "right": wall([1, 0, 0], [0, 1, 0], -90, colour(0.1, 0.6, 0.1)),
+        "block": {"type": "cube", "to_world": T().translate([0.3, -0.7, 0.1]).scale(0.3),
+                  "bsdf": block or colour(0.5, 0.5, 0.5)},
+        "lamp": wall([0, 0.98, 0], [1, 0, 0], 90, colour(0.1, 0.1, 0.1), 0.3,
+                     emitter={"type": "area", "radiance": {"type": "rgb", "value": [6, 5, 4]}}),
+        "spark": {"type": "point", "position": [-0.5, 0.2, 0.3], "intensity": 0.5}, **more,
+    })  # fmt: skip
+
+
+def tracked(scene, endings=("reflectance.value", "reflectance.data", "radiance.value", "intensity.value")):
+    """(parameters of `scene`, the keys with these endings, whose gradients are enabled)."""
+    params = mi.traverse(scene)
+    keys = sorted(k for k in params.keys() if k.endswith(tuple(endings)))  # their order differs from load to load
+    assert keys
+    for k in keys:
+        dr.enable_grad(params[k])
+    params.update()
+    return params, keys
+
+
+def adjoint_image(scene):
+    """What a loss says of the image: another factor for each pixel and colour, most of one sign."""
+    height, width = scene.sensors()[0].film().crop_size()
+    weights = np.random.default_rng(1).uniform(-0.2, 1, (height, width, 3))
+    return mi.TensorXf((weights / weights.size).astype(np.float32))
+
+
+def gradients_of(scene, params, keys, integrator, spp, seed, grad=None):
+    """The gradients of `keys` in one array, by a call to ``render_backward``."""
+    for k in keys:
+        dr.set_grad(params[k], 0)
+    integrator.render_backward(scene, params, adjoint_image(scene) if grad is None else grad, 0, seed, spp)
+    return np.concatenate([np.array(dr.grad(params[k]), np.float64).ravel() for k in keys])
+
+
+def spread_of(scene, params, keys, integrator, spp, n=4):
+    """(mean gradients, their standard errors) over `n` seeds."""
+    runs = np.array([gradients_of(scene, params, keys, integrator, spp, 10 + s) for s in range(n)])
+    return runs.mean(0), runs.std(0, ddof=1) / n**0.5
+
+
+def agree(name, ours, theirs, allowed=0.05):
+    """The distance of two gradients (value, standard error), beyond that of noise, over the norm."""
+    (a, da), (b, db) = ours, theirs
+    noise = np.sum(da**2 + db**2)
+    off, norm = max(np.sum((a - b) ** 2) - noise, 0) ** 0.5, np.linalg.norm(b)
+    print(f"{name}: off by {off / norm:.2%} of the norm, noise {noise**0.5 / norm:.2%}")
+    assert noise**0.5 < 0.05 * norm, "the test says nothing"
+    assert off < allowed * norm
+
+
+def train(scene, name, **keys):
+    integrator = mi.load_dict({"type": name, **SMALL, **keys})
+    with dr.suspend_grad():
+        integrator.train_first(scene)
+    return integrator
+
+
+# ---------------------------------------------------------------- what is known
+
+
+@pytest.mark.parametrize("name", CACHED)
+def test_gradients_of_the_point_lit_sphere(name):
+    """Albedo ρ, intensity I: L = I/π ρ/(1 - ρ) everywhere, so dL/dρ = 4 and dL/dI = 1/π at 1/2 and π."""
+    scene = mi.load_file(str(scenes.path("point_lit_sphere")), resx=8, resy=8)
+    params, (wall_key, light_key) = tracked(scene)
+    integrator = mi.load_dict({"type": name, "train_frames": 48, "train_samples": 512})
+    image = mi.render(scene, params, integrator=integrator, spp=64, seed=1)
+    steps = integrator.cache.steps
+    dr.backward(dr.mean(image, axis=None))
+    albedo, intensity = np.array(dr.grad(params[wall_key])), np.array(dr.grad(params[light_key]))
+    print(name, albedo.ravel(), intensity.ravel())
+    np.testing.assert_allclose(albedo.ravel(), 4 / 3, rtol=0.02)
+    np.testing.assert_allclose(intensity.ravel(), 1 / (3 * np.pi), rtol=0.02)
+    assert integrator.cache.steps == steps, "the adjoint trains nothing"
+    mi.render(scene, params, integrator=integrator, spp=1)
+    assert integrator.cache.steps == steps + 1, "the next image does"
+
+
+def test_gradients_of_what_is_black():
+    """A colour of 0 has a derivative, where ``prb`` finds none: against finite differences."""
+    scene = room()
+    params, keys = tracked(scene, ("lamp.emitter.radiance.value", "left.bsdf.reflectance.value"))
+    params[keys[0]], params[keys[1]] = mi.Color3f(5, 0, 5), mi.Color3f(0.5, 0, 0.5)
+    for k in keys:
+        dr.enable_grad(params[k])
+    params.update()
+    integrator = train(scene, "nrc")
+    mean = mi.TensorXf(np.full((12, 12, 3), 1 / 432, np.float32))
+    found = gradients_of(scene, params, keys, integrator, 256, 1, mean)[[1, 4]]
+    path, step, images = mi.load_dict({"type": "path", "max_depth": 24}), 0.05, {}
+    with dr.suspend_grad():
+        for which, at in ((None, None), (0, mi.Color3f(5, step, 5)), (1, mi.Color3f(0.5, step, 0.5))):
+            known = None if which is None else dr.detach(params[keys[which]])
+            if which is not None:
+                params[keys[which]] = at
+                params.update()
+            images[which] = float(np.mean(np.array(mi.render(scene, integrator=path, spp=4096, seed=3))))
+            if which is not None:
+                params[keys[which]] = known
+                params.update()
+    expected = [(images[k] - images[None]) / step for k in (0, 1)]
+    print(found, expected)
+    np.testing.assert_allclose(found, expected, rtol=0.08)
+
+
+# ---------------------------------------------------------------- biased: within 5 % of prb's
+
+_REFERENCES = {}
+
+
+def scene_of(kind):
+    """(scene, parameters, keys) of a kind of room."""
+    glossy = {"type": "roughconductor", "alpha": {"type": "uniform", "value": 0.2}, "distribution": "ggx",
+              "specular_reflectance": {"type": "rgb", "value": 0.8}}  # fmt: skip
+    mask = {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "bsdf": colour(0.5, 0.5, 0.5)}}
+    sky = mi.Bitmap(np.random.default_rng(2).uniform(0, 1, (4, 8, 3)).astype(np.float32))
+    more = {"diffuse": {}, "glossy": {"block": glossy}, "mirror": {"block": {"type": "conductor"}},
+            "mask": {"block": mask}, "sky": {"sky": {"type": "envmap", "bitmap": sky}}}[kind]  # fmt: skip
+    scene = room(**more)
+    ends = ("reflectance.value", "reflectance.data", "radiance.value", "intensity.value", "alpha.value", "sky.data")
+    return scene, *tracked(scene, ends)
+
+
+def reference(kind):
+    """(scene, parameters, keys, gradients by ``prb`` and their errors), the last ones computed once.
+
+    No scene is kept: derivatives would be carried into the parameters of all scenes alive that want them.
+    """
+    scene, params, keys = scene_of(kind)
+    if kind not in _REFERENCES:
+        prb = mi.load_dict({"type": "prb", "max_depth": 24})
+        _REFERENCES[kind] = spread_of(scene, params, keys, prb, 1024)
+    return scene, params, keys, _REFERENCES[kind]
+
+
+@pytest.mark.parametrize("name, kind", [
+    *((name, "diffuse") for name in BY_CACHE), ("nirc", "glossy"), ("nrc", "mirror"),
+    *(pytest.param(name, kind, marks=pytest.mark.slow) for name in BY_CACHE for kind in (
+        "glossy", "mirror", "mask", "sky")),
+])  # fmt: skip
+def test_gradients_by_the_cache_are_those_of_prb(name, kind):
+    scene, params, keys, theirs = reference(kind)
+    ours = spread_of(scene, params, keys, train(scene, name), 128)
+    agree(f"{name}, {kind}", ours, theirs)
+
+
+def test_direct_light_at_the_end_is_traced_where_the_cache_lacks_it():
+    scene, params, keys, theirs = reference("diffuse")
+    integrator = train(scene, "nrc", cache_content="indirect")
+    agree("nrc, indirect", spread_of(scene, params, keys, integrator, 128), theirs)
+
+
+# ---------------------------------------------------------------- unbiased: prb itself
+
+
+@pytest.mark.parametrize("keys", [{"type": "nirc_two_level"}, {"type": "nrc", "gradient": "prb"},
+                                  {"type": "nirc", "max_depth": 2}])  # fmt: skip
+def test_without_the_cache_gradients_are_prbs_own(keys):
+    """By its key, by default where the image is unbiased, and where no cache is needed."""
+    scene = room(width=6)
+    params, wanted = tracked(scene)
+    integrator = mi.load_dict({**SMALL, "rr_depth": 3, "hide_emitters": True, "max_depth": 6, **keys})
+    prb = mi.load_dict({"type": "prb", "max_depth": keys.get("max_depth", 6), "rr_depth": 3, "hide_emitters": True})
+    a, b = (gradients_of(scene, params, wanted, x, 16, 3) for x in (integrator, prb))
+    assert np.linalg.norm(a) > 0
+    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * np.abs(b).max())
+
+
+# ---------------------------------------------------------------- as Mitsuba's own
+
+
+@pytest.fixture
+def warnings():
+    """What Mitsuba logs as a warning."""
+    found, known = [], mi.logger().appender(0)
+
+    class Catcher(mi.Appender):
+        def append(self, level, text):
+            if level >= mi.LogLevel.Warn:
+                found.append(text)
+
+        def log_progress(self, *_):
+            pass
+
+    logger = mi.logger()
+    logger.clear_appenders()
+    logger.add_appender(Catcher())
+    yield found
+    logger.clear_appenders()
+    logger.add_appender(known)
+
+
+@pytest.mark.parametrize("name", ["nirc", "nrc"])
+def test_forward_and_backward_are_transposes(name):
+    """<δ, J v> = <Jᵀ δ, v> with the same samples; a Gaussian filter, a crop window, channels."""
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 8,
+            "crop_height": 7, "rfilter": {"type": "gaussian"}, "pixel_format": "rgba",
+            "sample_border": True}  # fmt: skip
+    eye = {"type": "perspective", "fov": 45, "to_world": T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]), "film": film}
+    scene = room(eye=eye)
+    params, key = mi.traverse(scene), "floor.bsdf.reflectance.data"
+    integrator = train(scene, name, channels="depth", train_frames=8)
+    known, t = mi.TensorXf(params[key]), mi.Float(0)
+    v = np.random.default_rng(3).normal(size=known.shape).astype(np.float32)
+    dr.enable_grad(t)
+    params[key] = known + mi.TensorXf(v) * t
+    params.update()
+    dr.forward(t, dr.ADFlag.ClearEdges)
+    image = np.array(integrator.render_forward(scene, params, 0, 5, 16), np.float64)
+    assert image.shape == (7, 8, 5) and (image[..., 3:] == 0).all()
+    δ = np.random.default_rng(4).normal(size=image.shape).astype(np.float32)
+    δ[..., 3:] = 0
+    params[key] = known
+    dr.enable_grad(params[key])
+    params.update()
+    back = gradients_of(scene, params, [key], integrator, 16, 5, mi.TensorXf(δ))
+    left, right = np.sum(image * δ), np.sum(back * v.ravel())
+    print(left, right)
+    assert left == pytest.approx(right, rel=2e-3, abs=1e-3 * np.linalg.norm(back) * np.linalg.norm(v))
+
+
+def test_seeds_and_samples_are_those_of_the_gradient():
+    scene = room(width=6)
+    params, keys = tracked(scene)
+    integrator = train(scene, "nrc", train_steps=0, train_frames=8)
+
+    def by(**numbers):
+        for k in keys:
+            dr.set_grad(params[k], 0)
+        dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=2, **numbers), axis=None))
+        return np.concatenate([np.array(dr.grad(params[k])).ravel() for k in keys])
+
+    first = by(seed=1, seed_grad=7, spp_grad=4)
+    again, other, more = by(seed=2, seed_grad=7, spp_grad=4), by(seed=1, seed_grad=8, spp_grad=4), by(seed=1)
+    np.testing.assert_allclose(first, again, rtol=1e-3, atol=1e-4 * np.abs(first).max())
+    for different in (other, more):
+        assert np.abs(first - different).max() > 1e-2 * np.abs(first).max()
+
+
+def test_passes_of_one_gradient_add_up(monkeypatch):
+    scene = room(width=6)
+    params, keys = tracked(scene)
+    integrator = train(scene, "nrc", train_frames=8)
+    whole = gradients_of(scene, params, keys, integrator, 8, 3)
+    monkeypatch.setattr(importlib.import_module("mi_neural.integrators.gradients"), "PASS_SAMPLES", 36 * 2)
+    parts = gradients_of(scene, params, keys, integrator, 8, 3)
+    np.testing.assert_allclose(whole, parts, rtol=0.3, atol=0.1 * np.abs(whole).max())
+    assert not np.array_equal(whole, parts)
+
+
+def test_gradients_are_recorded_once():
+    """Other values, seeds and loss images replay one recording; what it gives is what is traced without."""
+    scene = room(width=6)
+    params, keys = tracked(scene)
+    integrator = train(scene, "nirc", train_frames=8)
+    first = gradients_of(scene, params, keys, integrator, 4, 1)
+    gradients_of(scene, params, keys, integrator, 4, 2)
+    function = next(f for k, f in integrator.film_state.passes.recorded.items() if k[0] == "adjoint")
+    known = function.n_recordings
+    params[keys[0]] = dr.detach(params[keys[0]]) * 0.9
+    dr.enable_grad(params[keys[0]])
+    params.update()
+    for seed in range(3):
+        mi.render(scene, params, integrator=integrator, spp=1, seed=seed)
+        replayed = gradients_of(scene, params, keys, integrator, 4, seed)
+    assert function.n_recordings <= known + 1
+    integrator.records = False
+    np.testing.assert_allclose(replayed, gradients_of(scene, params, keys, integrator, 4, 2), rtol=1e-3, atol=1e-5)
+    assert not np.array_equal(first, replayed)
+
+
+def test_shapes_have_the_gradient_of_prb_and_are_named_once(warnings):
+    scene = room(width=6)
+    params, keys = tracked(scene, ("block.vertex_positions", "left.bsdf.reflectance.value"))
+    integrator = train(scene, "nrc", train_frames=8)
+    a = gradients_of(scene, params, keys, integrator, 16, 3)
+    gradients_of(scene, params, keys, integrator, 16, 4)
+    b = gradients_of(scene, params, keys, mi.load_dict({"type": "prb", "max_depth": -1}), 16, 3)
+    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(b).max())
+    said = [w for w in warnings if "gradients come from prb" in w]
+    assert len(said) == 1 and "block.vertex_positions" in said[0]
+
+
+def test_channels_without_gradient_are_named_once(warnings):
+    scene = room(width=6)
+    params, keys = tracked(scene)
+    for gradient in ("cache", "prb"):
+        integrator = train(scene, "nrc", train_frames=8, channels="depth", gradient=gradient)
+        for _ in range(2):
+            image = mi.render(scene, params, integrator=integrator, spp=1)
+            dr.backward(dr.mean(image, axis=None))
+            assert np.isfinite(np.array(dr.grad(params[keys[0]]))).all()
+    assert len([w for w in warnings if "depth have no gradient" in w]) == 2
+
+
+def test_unknown_way_of_differentiating_is_refused():
+    with pytest.raises(Exception, match="give one of: cache, prb"):
+        mi.load_dict({"type": "nirc", "gradient": "both"})
+
+
+# ---------------------------------------------------------------- inverse rendering
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BY_CACHE)
+def test_colours_texture_and_lamp_are_found_from_an_image(name):
+    scene = room(width=16)
+    target = mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 24}), spp=2048)
+    params = mi.traverse(scene)
+    keys = ["left.bsdf.reflectance.value", "right.bsdf.reflectance.value", "floor.bsdf.reflectance.data",
+            "lamp.emitter.radiance.value"]  # fmt: skip
+    true = {k: np.array(params[k]) for k in keys}
+    optimizer = mi.ad.Adam(lr=0.05)
+    for k in keys:
+        optimizer[k] = dr.full(type(params[k]), 0.5, dr.width(params[k])) if k != keys[2] else params[k] * 0 + 0.5
+    optimizer[keys[3]] = mi.Color3f(3)
+    optimizer.set_learning_rate({keys[3]: 0.2})
+    params.update(optimizer)
+    integrator = mi.load_dict({"type": name, **SMALL})
+    for step in range(120):
+        image = mi.render(scene, params, integrator=integrator, spp=8, seed=step)
+        dr.backward(dr.mean(dr.square(image - target) / (dr.square(target) + 0.1), axis=None))
+        optimizer.step()
+        for k in keys[:3]:
+            optimizer[k] = dr.clip(optimizer[k], 0, 1)
+        params.update(optimizer)
+    for k, tolerance in zip(keys, (0.05, 0.05, 0.1, 0.5), strict=True):
+        error = np.abs(np.array(params[k]) - true[k]).mean()
+        print(k, error)
+        assert error < tolerance
