@@ -88,14 +88,12 @@ class OutgoingIntegrator(CacheIntegrator):
     # -------------------------------------------------------------------------------------------------------------
 
     def incident_radiance(self, scene, field, path, found, after, sampler):
-        field = getattr(field, "outgoing", field)
         return gradients.by_outgoing_cache(self, scene, field, self.content, after, sampler)
 
     PROBES = 1
 
     def probe(self, field, x, sampler):
         normal, w = (mi.warp.square_to_uniform_sphere(sampler.next_2d()) for _ in range(2))
-        field = getattr(field, "outgoing", field)
         return field.query(x, normal, w, mi.Color3f(sampler.next_1d()), sampler.next_1d())
 
     def file_facts(self) -> dict:

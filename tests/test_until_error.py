@@ -31,7 +31,7 @@ def test_true_error_lies_in_the_interval_as_often_as_it_says(n, tail):
         found, true = film.error(), metrics.relmse_trimmed(film.mean(), known)
         inside += found.low <= true <= found.high
         ratios.append(found.value / true)
-    print(f"{n} passes: {inside / 300:.3f} of the true errors inside, said {CONFIDENCE}; over truth {np.mean(ratios):.3f}")
+    print(f"{n} passes: {inside / 300:.3f} of the true errors inside of {CONFIDENCE}; ratio {np.mean(ratios):.3f}")
     least = CONFIDENCE - 4 * (CONFIDENCE * (1 - CONFIDENCE) / 300) ** 0.5
     assert inside / 300 >= least and abs(np.mean(ratios) - 1) < 0.03
 
