@@ -58,7 +58,7 @@ def blas_flops(rows: int, inner: int, columns: int) -> float:
 def trained_network(integrator):
     """The averaged weights of the network that the integrator's cache queries; None if it has none."""
     field = getattr(getattr(integrator, "cache", None), "field", None)
-    return getattr(getattr(field, "incident", field), "averaged", None)
+    return getattr(field, "averaged", None)
 
 
 def network_seconds(weights) -> float:

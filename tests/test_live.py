@@ -199,7 +199,7 @@ class Directions:
 
 
 class Asked:
-    asked = Directions()
+    queried = Directions()
 
 
 class Holder:

@@ -189,10 +189,10 @@ class VisibilityMap:
 
 def _cache(integrator):
     """What answers queries of radiance; :class:`Unavailable` where there is nothing, or not yet."""
-    field = getattr(getattr(integrator, "cache", None), "asked", None)
+    field = getattr(getattr(integrator, "cache", None), "queried", None)
     if field is None:
         raise Unavailable("no cache of radiance here; use nirc or nrc, and train it or render an image first")
-    return getattr(field, "incident", field)  # of both caches, that of incident light
+    return field
 
 
 def _lights(integrator):
