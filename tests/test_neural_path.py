@@ -247,6 +247,7 @@ def test_older_name_still_works_and_says_the_new_one(plugin, keys, box, capfd):
     old = mi.load_dict({"type": plugin, **SMALL, "termination": "auto", **keys})
     assert "type: neural_path" in "".join(capfd.readouterr())
     new = auto(**({"channels": "traced"} if keys else {}))
+    assert type(old) is type(new) and str(old) == str(new) and old.channels == new.channels
     # Trained: equal but for the order of sums
     np.testing.assert_allclose(render(box, old, 4), render(box, new, 4), rtol=0.03, atol=1e-3)
 

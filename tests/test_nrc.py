@@ -367,21 +367,28 @@ def two_rooms() -> mi.Scene:
     return mi.load_dict({"type": "scene", **parts})
 
 
-def test_what_leaves_the_view_is_not_forgotten():
-    """Trained in one room, then in the other, then asked in the first: world-space records keep it."""
+@pytest.mark.parametrize("keys", [{"learning_rate": 0.03}, {}], ids=["slow", "default"])
+def test_what_leaves_the_view_is_not_forgotten(keys):
+    """Trained in one room, then in the other, then asked in the first: world-space records keep it.
+
+    At the default rate less is forgotten without them (0.24 instead of 0.32, four seeds), and with them the error is
+    0.07 to 0.09 instead of 0.07.
+    """
     scene = two_rooms()
     here, there = scene.sensors()
     path = np.array(mi.render(scene, sensor=here, integrator=mi.load_dict({"type": "path"}), spp=256))
     errors = {}
     for share in (0.0, 0.25):
-        integrator = nrc(world_share=share, spread_threshold=0.0)
+        integrator = nrc(world_share=share, spread_threshold=0.0, **keys)
         integrator.train(scene, 60, sensor=here)
         before = render(scene, integrator, 16, sensor=here)
         integrator.train(scene, 120, sensor=there)
         after = render(scene, integrator, 16, sensor=here)
         errors[share] = [np.sqrt(np.mean((i - path) ** 2)) / path.mean() for i in (before, after)]
     print(f"rms errors before and after looking away: {errors}")
-    assert errors[0.25][1] < 0.4 and errors[0.25][1] < 0.4 * errors[0.0][1]
+    assert errors[0.25][1] < 0.11
+    if keys:
+        assert errors[0.25][1] < 0.3 * errors[0.0][1]
 
 
 def test_remembered_places_are_an_even_sample_of_all_steps():
