@@ -18,12 +18,12 @@ from mi_neural.caches.files import damaged
 from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.integrators import gradients, planning
-from mi_neural.integrators.base import FilmIntegrator, as_seed
+from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
-from mi_neural.render.frozen import LOCK, undisturbed
+from mi_neural.render.frozen import undisturbed
 from mi_neural.render.sampling import PathSampler
 
 #: Frames that `train_frames = -1` trains at least and at most.
@@ -465,45 +465,7 @@ class CacheIntegrator(FilmIntegrator):
         differentiated: (Li, sampler)."""
         return gradients.by_incident_cache(self, scene, field, path, found, after, sampler)
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-        """The image's derivative along the gradients that `params` have, by the method of the key ``gradient``."""
-        sensor = self._checked(scene, sensor, spp)
-        with LOCK, dr.suspend_grad():
-            if self._differentiates_by_cache(scene, params, sensor):
-                return gradients.forward(self, scene, sensor, as_seed(seed), spp or sensor.sampler().sample_count())
-            image = gradients.prb_of(self).render_forward(scene, params, sensor, seed, spp)
-            missing = dr.zeros(mi.TensorXf, (*image.shape[:2], len(self.aov_names())))
-            return dr.concat([image, missing], axis=2) if self.channels else image
-
-    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        """Carry `grad_in`, derivatives with respect to the image, to the parameters, by the method of ``gradient``."""
-        sensor = self._checked(scene, sensor, spp)
-        with LOCK, dr.suspend_grad():
-            if self._differentiates_by_cache(scene, params, sensor):
-                spp = spp or sensor.sampler().sample_count()
-                gradients.backward(self, scene, grad_in, sensor, as_seed(seed), spp)
-                return
-            if self.channels:
-                grad_in = grad_in[:, :, : grad_in.shape[2] - len(self.aov_names())]
-            gradients.prb_of(self).render_backward(scene, params, grad_in, sensor, seed, spp)
-
-    def _differentiates_by_cache(self, scene, params, sensor) -> bool:
-        """Whether derivatives come from the cache. What stands against it, or is left out, is said once."""
-        if self.channels:
-            self.state.say_once(f"{self.plugin}: the channels {', '.join(self.channels)} have no gradient")
-        if self.gradient == "prb":
-            return False
-        with dr.resume_grad():
-            moving = gradients.moved(scene, params)
-        if moving:
-            self.state.say_once(
-                f"{self.plugin}: gradients come from prb, because the cache has none of shapes and sensors: "
-                f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
-            )
-            return False
-        if not self.state.bound.knows(scene) or (self.needs_cache and self.cache.field is None):
-            self.bind(scene, sensor)
-        return self.needs_cache
+    render_forward, render_backward = gradients.render_forward, gradients.render_backward
 
     def rendered(self, spp: int) -> None:
         self._publish()

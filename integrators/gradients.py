@@ -22,10 +22,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.estimators.spread import SHARP_PDF
+from mi_neural.integrators.base import as_seed
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import PACKET, PASS_SAMPLES, Area, Samples, camera_rays
-from mi_neural.render.frozen import can_freeze, is_recording, undisturbed
+from mi_neural.render.frozen import LOCK, can_freeze, is_recording, undisturbed
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
 #: Values of the key ``gradient``.
@@ -59,6 +60,60 @@ def prb_of(integrator):
         "type": "prb", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth,
         "hide_emitters": integrator.hide,
     })  # fmt: skip
+
+
+# -----------------------------------------------------------------------------------------------------------------
+# Methods of the integrators
+
+
+def render_forward(integrator, scene, params, sensor=0, seed=0, spp=0):
+    """The image's derivative along the gradients that `params` have, by the method of the key ``gradient``."""
+    sensor = integrator._checked(scene, sensor, spp)
+    with LOCK, dr.suspend_grad():
+        if _by_cache(integrator, scene, params, sensor):
+            return forward(integrator, scene, sensor, as_seed(seed), spp or sensor.sampler().sample_count())
+        image = prb_of(integrator).render_forward(scene, params, sensor, seed, spp)
+        missing = dr.zeros(mi.TensorXf, (*image.shape[:2], len(integrator.aov_names())))
+        return dr.concat([image, missing], axis=2) if integrator.channels else image
+
+
+def render_backward(integrator, scene, params, grad_in, sensor=0, seed=0, spp=0):
+    """Carry `grad_in`, derivatives with respect to the image, to the parameters, by the method of ``gradient``."""
+    sensor = integrator._checked(scene, sensor, spp)
+    with LOCK, dr.suspend_grad():
+        if _by_cache(integrator, scene, params, sensor):
+            spp = spp or sensor.sampler().sample_count()
+            backward(integrator, scene, grad_in, sensor, as_seed(seed), spp)
+            return
+        if integrator.channels:
+            grad_in = grad_in[:, :, : grad_in.shape[2] - len(integrator.aov_names())]
+        prb_of(integrator).render_backward(scene, params, grad_in, sensor, seed, spp)
+
+
+def _by_cache(integrator, scene, params, sensor) -> bool:
+    """Whether derivatives come from the cache. What stands against it, or is left out, is named once."""
+    plugin, state = integrator.plugin, integrator.state
+    if integrator.channels:
+        state.say_once(f"{plugin}: the channels {', '.join(integrator.channels)} have no gradient")
+    if integrator.nested_sampler is not None or state.lights is not None:
+        name = getattr(integrator.light_sampler, "plugin", "a light sampler")
+        state.say_once(
+            f"{plugin}: gradients choose lights as Mitsuba does, without {name}; where that is wrong (mi-neural doc "
+            "limits) they are wrong, too"
+        )
+    if integrator.gradient == "prb":
+        return False
+    with dr.resume_grad():
+        moving = moved(scene, params)
+    if moving:
+        state.say_once(
+            f"{plugin}: gradients come from prb, because the cache has none of shapes and sensors: "
+            f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
+        )
+        return False
+    if not state.bound.knows(scene) or (integrator.needs_cache and integrator.cache.field is None):
+        integrator.bind(scene, sensor)
+    return integrator.needs_cache
 
 
 # -----------------------------------------------------------------------------------------------------------------

@@ -23,8 +23,8 @@ SLOW = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def place():
-    # Mitsuba 3.9.1 orders the lights of a scene anew in each load, and with them the network's outputs: a fixed order is
-    # part of a fixed seed. With the other one a healthy run has an error of 0.051, a recovered one of 0.08 to 0.12
+    # Mitsuba 3.9.1 orders the lights of a scene anew in each load, and with them the network's outputs: their order is
+    # a part of the seed. With the other one a healthy run has an error of 0.051, a recovered one of 0.08 to 0.12
     for _ in range(200):
         scene = room()()
         if scene.emitters()[0].bbox().center().x < -0.5:

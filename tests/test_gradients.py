@@ -325,6 +325,17 @@ def test_shapes_have_the_gradient_of_prb_and_are_named_once(warnings):
     assert len(said) == 1 and "block.vertex_positions" in said[0]
 
 
+@pytest.mark.parametrize("gradient", ["cache", "prb"])
+def test_light_sampler_that_has_no_part_in_gradients_is_named_once(warnings, gradient):
+    scene = room(width=6)
+    params, keys = tracked(scene)
+    keys_of = {"train_frames": 8, "gradient": gradient}
+    nested = train(scene, "nrc", **keys_of, light_sampler={"type": "power_lights"})
+    for seed in range(2):
+        gradients_of(scene, params, keys, nested, 1, seed)
+    assert len([w for w in warnings if "as Mitsuba does, without power_lights" in w]) == 1
+
+
 def test_channels_without_gradient_are_named_once(warnings):
     scene = room(width=6)
     params, keys = tracked(scene)

@@ -293,22 +293,29 @@ def render_until(
     """Render until the estimated trimmed relMSE is at most `error`, or for `seconds` if that comes first. Returns the
     image and the estimate, which knows of noise and not of bias (:class:`~mi_neural.image.moments.Groups`).
 
-    An eighth of the samples so far at most is rendered between two looks, and no more than the error asks for.
+    An integrator that says how noisy tracing is (`noise_of_pairs`) is asked for an image of so many samples that
+    tracing alone would have this error: then its bias may not pass for little noise.
+
+    Between two looks at the error there are nine tenths of the samples that seem to be missing, at most as many as
+    there are already.
     """
-    start, film, estimate = clock(), Groups(), None
+    start, film, estimate, needed = clock(), Groups(), None, 4.0
     run = _Run(scene, integrator, seed, sensor, keep, 0, film)
     sizes = pass_sizes(scene, sensor)
     try:
-        while seconds is None or clock() - start < seconds:
-            needed = film.spp * (estimate.value / error) if estimate else 4
-            if estimate and estimate.value <= error:
-                break
-            most = max(1, min(film.spp // 8, round(needed) - film.spp))
-            run.plan(max(round(needed), film.spp + 1))
-            run.one_pass(max(s for s in sizes if s <= most))
+        while estimate is None or estimate.value > error:
+            traced = statistics(integrator).get("noise_of_pairs", 0.0) / error
+            run.plan(max(round(needed), round(traced), film.spp + 1))
+            look = film.spp + max(1, min(film.spp, round(0.9 * (needed - film.spp))))
+            while film.spp < look:
+                if film.spp and seconds is not None and clock() - start >= seconds:
+                    return run.result(), film.error()
+                run.one_pass(max(s for s in sizes if s == 1 or s <= look - film.spp))
             estimate = film.error()
-            if progress and estimate:
-                progress(min(error / max(estimate.value, 1e-30), 1.0), 1.0)
+            if estimate:
+                needed = film.spp * estimate.value / error
+                if progress:
+                    progress(min(film.spp, needed), needed)
     except KeyboardInterrupt:
         run.interrupted = True
     finally:

@@ -88,6 +88,8 @@ def render(
     else:
         case = benchmark.own_case(loaded, keys)
     terminal.require_cache_methods(case, pretrain, save_cache, load_cache)
+    if until_error is not None and getattr(case.integrator, "cumulative", False):
+        raise InputError("--until-error compares passes, but images of this integrator hold all passes before them")
     output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
     ref = references.of_film(reference, loaded) if reference else None
     terminal.depth_notes(ref, loaded, [case])

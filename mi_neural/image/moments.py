@@ -120,7 +120,7 @@ class Groups(Accumulator):
     """
 
     #: Most groups; twice as many are merged in pairs.
-    MOST = 16
+    MOST = 8
 
     def __init__(self) -> None:
         super().__init__()
@@ -141,16 +141,17 @@ class Groups(Accumulator):
         """The estimate; None after fewer than four groups."""
         if len(self.groups) < 4:
             return None
-        mean = self.mean()[..., :3].astype(np.float64)
+        mean = self.mean()[..., :3]
         # The noise of a group must not choose its own weight: the others do
-        whole = sum(n * image.astype(np.float64) for image, n in self.groups)
+        whole = sum(np.float32(n) * image for image, n in self.groups)
         squares = []
         for image, n in self.groups:
-            others = (whole - n * image) / max(self.spp - n, 1)
-            squares.append(n * (image - mean) ** 2 * metrics.relative_weights(metrics.luminance(others))[..., None])
+            others = metrics.luminance((whole - np.float32(n) * image) * np.float32(1 / max(self.spp - n, 1)))
+            weight = metrics.relative_weights(others)[..., None].astype(np.float32)
+            squares.append(np.float32(n) * (image - mean) ** 2 * weight)
         total = sum(squares)
-        kept = total <= np.quantile(total, 1 - metrics.TRIM_FRACTION)
-        each = np.array([s[kept].sum() / kept.size for s in squares])
+        kept = total <= np.partition(total, k := int((1 - metrics.TRIM_FRACTION) * (total.size - 1)), axis=None)[k]
+        each = np.array([s.sum(where=kept, dtype=np.float64) / kept.size for s in squares])
         G, N = len(each), self.spp
         # 1 / m² of a noisy m is too large by three times its relative variance
         brightness = metrics.luminance(mean)
