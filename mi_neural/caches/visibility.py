@@ -7,7 +7,7 @@ with one output per light, learned from shadow rays while rendering. It depends 
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -44,7 +44,6 @@ class VisibilityField(TrainedField):
     ``query(x)`` gives a list of Dr.Jit floats. An untrained field says about 1/2 for all.
     """
 
-    KIND, WEIGHTS = "visibility", Weights
     DRJIT_STRUCT = {  # noqa: RUF012
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "stride": object,
     }  # fmt: skip
@@ -88,13 +87,6 @@ class VisibilityField(TrainedField):
         self.averaged.pack()
         dr.eval(self.averaged)
         return loss
-
-    def constants(self) -> dict:
-        return {"shape": asdict(self.shape), "box": self.box, "seed": self.seed}
-
-    @classmethod
-    def make(cls, constants: dict) -> VisibilityField:
-        return cls(*constants["box"], FieldShape(**constants["shape"]), constants["seed"])
 
 
 def _sigmoid(v):
