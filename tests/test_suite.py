@@ -37,8 +37,8 @@ def folder(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def compare(*arguments: object, code: int = 0) -> str:
-    common = ["compare", "--scenes", "scenes", "--reference-cache", "references", "-o", "out"]
+def compare(*arguments: object, code: int = 0, of: tuple[str, ...] = ("--scenes", "scenes")) -> str:
+    common = ["compare", *of, "--reference-cache", "references", "-o", "out"]
     result = CliRunner().invoke(app, [*common, *map(str, arguments)])
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -168,6 +168,7 @@ def test_another_seed_learns_by_other_numbers():
 
 # ---------------------------------------------------------------- the command
 
+MOON = ("scenes/moon.xml",)
 QUICK = ("-i", "path:max_depth=2", "-i", "fake_cache:fraction=0.2,max_depth=2", "--seconds", "0.03", "--reference-spp",
          "64", "--repeats", "3")  # fmt: skip
 
@@ -251,3 +252,55 @@ def test_interrupted_comparison_of_scenes_goes_on(monkeypatch):
     curve = [(r["scene"], r["label"], r["repeat"], r["spp"]) for r in results()["rows"] if r["mode"] == "curve"]
     assert len(set(curve)) == len(curve) and {c[:3] for c in curve} == {r[:3] for r in after}
     assert not list(Path("out").rglob("rows.jsonl"))
+
+
+# ---------------------------------------------------------------- images made elsewhere
+
+
+def test_images_made_elsewhere_stand_beside_ours():
+    exr.write("moon_reference.exr", np.full((6, 6, 3), 2.0))
+    exr.write("flat.exr", np.full((12, 12, 3), 1.0))  # twice the film's size: averaged
+    said = compare("--reference", "moon_reference.exr", *QUICK[:4], "--seconds", "0.03", "--size", "6x6",
+                   "--image", "Other=flat.exr,seconds=0.03,spp=9", "--image", "Other=flat.exr,seconds=0.03",
+                   "--image", "Cleaned=flat.exr,seconds=4,denoised=true", of=MOON)  # fmt: skip
+    assert "Other" in said and "Cleaned + denoiser" in said
+    found = results()
+    rows = {(r["label"], r["repeat"]): r for r in found["rows"] if r["mode"] == "one-shot"}
+    other = rows["Other", 0]
+    assert other["relmse"] == pytest.approx(1.0 / 4.04, rel=1e-4), "(1 - 2)² / (2² + 1 % of the mean's square)"
+    assert other["budget_seconds"] == other["seconds_total"] == 0.03 and other["spp"] == 9
+    assert other["ns_per_sample"] == pytest.approx(0.03e9 / (9 * 36)) and rows["Other", 1]["spp"] is None
+    assert rows["Cleaned", 0]["denoised"] and rows["Cleaned", 0]["budget_seconds"] == 4
+    assert exr.read(Path("out") / other["image"]).rgb.shape == (6, 6, 3)
+    labels = [g["label"] for g in found["groups"]]
+    assert labels[-2:] == ["Other", "Cleaned"] and labels[0] == "path:max_depth=2", "factors are against ours"
+    page = Path("out/report.html").read_text()
+    assert "Other, one-shot 0.03 s" in page and "Cleaned + denoiser, one-shot 4 s" in page
+    assert "Other" in Path("out/table.md").read_text() and "Other" in Path("out/curves_one-shot.svg").read_text()
+
+
+def test_images_made_elsewhere_say_which_of_several_scenes_they_show():
+    exr.write("flat.exr", np.full((8, 8, 3), 1.0))
+    quick = ("-i", "path:max_depth=2", "--seconds", "0.01", "--reference-spp", "16", "--image")
+    compare(*quick, "Other=flat.exr,seconds=1,scene=moon")
+    assert [r["scene"] for r in results()["rows"] if r["label"] == "Other"] == ["moon"]
+    for typed, expected in (
+        ("Other=flat.exr,seconds=1", "add scene=NAME, one of ball, moon"),
+        ("Other=flat.exr,seconds=1,scene=sun", "no scene 'sun' here; there is ball, moon"),
+        ("Other=flat.exr", "--image takes NAME=FILE.exr,seconds=T"),
+        ("flat.exr,seconds=1", "--image takes NAME=FILE.exr,seconds=T"),
+        ("Other=flat.exr,seconds=1,sampels=3", "--image takes NAME=FILE.exr,seconds=T"),
+        ("Other=flat.exr,seconds=-1", "seconds must be a number greater than 0"),
+        ("Other=flat.exr,seconds=1,denoised=yes", "denoised is true or false, got 'yes'"),
+        ("Other=none.exr,seconds=1", "no such image: none.exr"),
+    ):
+        assert expected in compare(*quick, typed, code=2).replace("\n", " ")
+
+
+def test_image_made_elsewhere_of_another_size_is_refused():
+    exr.write("wide.exr", np.full((5, 9, 3), 1.0))
+    Path("other.exr").write_text("no image")
+    quick = ("-i", "path:max_depth=2", "--seconds", "0.01", "--reference-spp", "16", "--image")
+    said = compare(*quick, "Other=wide.exr,seconds=1", code=2, of=MOON)
+    assert "wide.exr is 9x5, the film 8x8: add --size 9x5" in said
+    assert "not a readable EXR image" in compare(*quick, "Other=other.exr,seconds=1", code=2, of=MOON)

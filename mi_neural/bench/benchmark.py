@@ -50,8 +50,8 @@ class Row:
     """One line of a table: what was rendered, what it cost, what it is worth. Times in seconds, of one frame.
 
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
-    of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind.
-    `seconds_to_first_image` counts from the start of the process, compiling included.
+    of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind, `spp` of an image made
+    elsewhere (:mod:`.elsewhere`). `seconds_to_first_image` counts from the start of the process, compiling included.
     """
 
     scene: str
@@ -63,13 +63,13 @@ class Row:
     mode: str
     frames: int
     denoised: bool
-    spp: float
+    spp: float | None
     seconds_compile: float
     seconds_train: float
     seconds_render: float
     seconds_denoise: float
     seconds_total: float
-    ns_per_sample: float
+    ns_per_sample: float | None
     ns_per_query: float | None
     records: int | None
     queries: int | None
@@ -90,6 +90,11 @@ class Row:
     seconds_to_first_image: float | None = None
     statistics: dict[str, object] = field(default_factory=dict)
     environment: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def made_elsewhere(self) -> bool:
+        """Whether another renderer made the image."""
+        return "made_elsewhere" in self.statistics
 
     def to_json(self) -> dict[str, object]:
         """The row as a dictionary of plain values."""

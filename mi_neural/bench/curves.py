@@ -15,10 +15,10 @@ AXES = {"seconds_total": "seconds", "spp": "samples a pixel"}
 
 def line(rows: Iterable[Row], over: str, name: str) -> list[tuple[float, float, float, float]]:
     """Points (x, y, least y, largest y) of rows that differ by budget, samples and repeat: means over the repeats at
-    each budget, of a curve at each number of samples."""
+    each budget, of a curve at each number of samples. Rows that lack either value are left out."""
     places: dict[float, list[Row]] = {}
     for row in rows:
-        if getattr(row, name):
+        if getattr(row, name) and getattr(row, over) is not None:
             place = row.spp if row.mode == "curve" else row.budget_seconds or 0.0
             places.setdefault(place, []).append(row)
     points = []

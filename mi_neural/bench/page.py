@@ -64,7 +64,7 @@ def entry(picture: Picture, exposure: float, exact: bool = True) -> dict[str, ob
     ]
     return {
         "name": f"{name_of(row)}, {kind}",
-        "caption": ", ".join([f"{number(row.spp)} spp", *errors]),
+        "caption": ", ".join([*([f"{number(row.spp)} spp"] if row.spp else []), *errors]),
         "integrator": row.label,
         "kind": kind,
         "denoiser": "denoised" if row.denoised else "raw",

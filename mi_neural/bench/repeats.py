@@ -81,14 +81,15 @@ class Group:
 
 
 def group(rows: Iterable[Row]) -> list[Group]:
-    """Rows by scene and :attr:`Group.key`, in the order in which they come; rows of a curve are left out."""
+    """Rows by scene and :attr:`Group.key`, in the order in which they come, images made elsewhere last; rows of a curve
+    are left out."""
     groups: dict[tuple, Group] = {}
     for row in rows:
         if row.mode == "curve":
             continue
         key = (row.scene, row.label, row.mode, row.budget_seconds, row.denoised)
         groups.setdefault(key, Group([])).rows.append(row)
-    return list(groups.values())
+    return sorted(groups.values(), key=lambda g: g.first.made_elsewhere)
 
 
 def tell_apart(found: Group, image: Callable[[Row], np.ndarray | None], reference: Reference) -> None:

@@ -11,7 +11,21 @@ from pathlib import Path
 
 from mi_neural.image import exr
 
-from . import benchmark, cluster, collection, denoise, environment, jobs, kept, load, page, repeats, report, terminal
+from . import (
+    benchmark,
+    cluster,
+    collection,
+    denoise,
+    elsewhere,
+    environment,
+    jobs,
+    kept,
+    load,
+    page,
+    repeats,
+    report,
+    terminal,
+)
 from . import reference as references
 from .load import InputError
 
@@ -32,6 +46,7 @@ class Settings:
     reference_spp    samples a pixel of rendered references
     reference_cache  folder in which these are kept
     denoise          have denoised rows, too
+    images           images made by other renderers
     """
 
     specs: list[load.IntegratorSpec]
@@ -43,11 +58,12 @@ class Settings:
     reference_spp: int | None = None
     reference_cache: Path | None = None
     denoise: bool = False
+    images: list[elsewhere.Image] = field(default_factory=list)
 
     def kinds(self) -> int:
         """Pictures of a scene."""
         steady = 1 + len(self.plan.frame_seconds) if self.plan.steady_frames else 0
-        return len(self.specs) * (len(self.plan.seconds) + steady) * (2 if self.denoise else 1)
+        return len(self.specs) * (len(self.plan.seconds) + steady) * (2 if self.denoise else 1) + len(self.images)
 
 
 @dataclass
@@ -81,6 +97,7 @@ class Suite:
         self.notes: list[str] = []
         self.interrupted = False
         self._kept: list[kept.Kept] = []
+        elsewhere.require_scenes(settings.images, collection.titles(files))
         if len(files) > 1:
             known = {name for file in files for name in load.scene_parameters(file)}
             if unknown := [name for name in settings.parameters if name not in known]:
@@ -210,6 +227,9 @@ class Suite:
             seconds = f"{guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp)"
             found.notes.append(f"The guides took {seconds}, counted for nobody.")
         shared = reference, guides
+        shown = elsewhere.of_scene(settings.images, found.name)
+        for picture in elsewhere.pictures(shown, loaded, reference, environment.describe()):
+            keep(picture)
         bench = benchmark.Bench(loaded, reference, guides, environment.describe(), keep, self.bars, done)
         for case in cases:
             if self.workers is not None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from mi_neural.bench import benchmark, cluster, collection, denoise, load, report, suite, terminal
+from mi_neural.bench import benchmark, cluster, collection, denoise, elsewhere, load, report, suite, terminal
 from mi_neural.bench.load import InputError
 from mi_neural.commands import options
 
@@ -61,6 +61,14 @@ def compare(
         Path | None, typer.Option(metavar="DIR", help="where rendered references are kept; default: the user's cache")
     ] = None,
     denoise_: options.Denoise = False,
+    image: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE.exr,seconds=T[,...]",
+            help="an image that another renderer made in T seconds (its denoiser's not counted), repeatable; further: "
+            "spp=N, denoised=true, scene=NAME",
+        ),
+    ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
     scheduler: options.Scheduler = None,
 ) -> None:
@@ -100,6 +108,7 @@ def compare(
         reference_spp=reference_spp,
         reference_cache=reference_cache,
         denoise=denoise_,
+        images=[elsewhere.parse(text) for text in image or []],
     )
     if denoise_:
         denoise.require()
