@@ -19,10 +19,12 @@ __version__ = "0.2.0"
 # Public names, and the modules that are imported when they are first used
 _LAZY = {
     "Field": "mi_neural.caches.field",
+    "denoise": "mi_neural.render.guides",
+    "guides": "mi_neural.render.guides",
     "live": "mi_neural.explore.live",
 }
 
-__all__ = ["Field", "LLVMError", "__version__", "live", "llvm", "register", "variant_problem"]
+__all__ = ["Field", "LLVMError", "__version__", "denoise", "guides", "live", "llvm", "register", "variant_problem"]
 
 
 def __getattr__(name):

@@ -1,7 +1,7 @@
-"""The denoiser in a comparison: its guides, and the time that it takes (:mod:`mi_neural.image.denoise` denoises).
+"""The denoiser in a comparison: its guides, and the time that it takes.
 
-The guides come from Mitsuba's `aov` integrator and are the same for all integrators of a comparison, so that none has a
-better denoiser than another. Their time is reported apart and belongs to no integrator.
+The guides (:mod:`mi_neural.render.guides`) are the same for all integrators of a comparison, so that none has a better
+denoiser than another. Their time is reported apart and belongs to no integrator.
 """
 
 from __future__ import annotations
@@ -12,22 +12,20 @@ import numpy as np
 
 from mi_neural.image import denoise as oidn
 
-from .budget import STREAM_GUIDES, clock, pass_seed, render_pass
+from .budget import STREAM_GUIDES, clock, pass_seed
 from .load import InputError
-
-#: Samples a pixel of the guides.
-GUIDE_SPP = 16
 
 
 @dataclass(frozen=True)
 class Guides:
     """Albedo in [0, 1] and shading normals in [-1, 1] (world space), float32 of shape (height, width, 3).
 
-    `seconds` is the wall time of rendering them, kernels compiled.
+    `clean`: their noise was removed. `seconds` is the wall time of making them, kernels compiled.
     """
 
     albedo: np.ndarray
     normal: np.ndarray
+    clean: bool
     seconds: float
 
 
@@ -40,19 +38,13 @@ def require() -> None:
 
 
 def render_guides(scene, seed: int = 0, sensor: int = 0) -> Guides:
-    """Albedo and shading normals of the first hit, through the scene's own film and reconstruction filter."""
-    import mitsuba as mi
+    """Albedo and shading normals of what each pixel shows, through the scene's own film and reconstruction filter."""
+    from mi_neural.render import guides
 
-    integrator = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
-    render_pass(scene, integrator, 1, pass_seed(seed, STREAM_GUIDES, 1), sensor)  # compiles
+    guides.guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 1))  # compiles
     start = clock()
-    image = render_pass(scene, integrator, GUIDE_SPP, pass_seed(seed, STREAM_GUIDES, 0), sensor)
-    image = np.nan_to_num(image[..., -6:].astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-    return Guides(
-        albedo=np.ascontiguousarray(image[..., :3].clip(0.0, 1.0)),
-        normal=np.ascontiguousarray(image[..., 3:].clip(-1.0, 1.0)),
-        seconds=clock() - start,
-    )
+    found = guides.guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 0))
+    return Guides(found.albedo, found.normal, found.clean, clock() - start)
 
 
 def denoise(rgb: np.ndarray, guides: Guides) -> tuple[np.ndarray, float]:
@@ -62,7 +54,7 @@ def denoise(rgb: np.ndarray, guides: Guides) -> tuple[np.ndarray, float]:
     """
     require()
     start = clock()
-    clean = oidn.denoise(rgb, guides.albedo, guides.normal)
+    clean = oidn.denoise(rgb, guides.albedo, guides.normal, guides.clean)
     return clean, clock() - start
 
 

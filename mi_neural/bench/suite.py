@@ -224,7 +224,7 @@ class Suite:
         self.bars("guides for the denoiser" if settings.denoise else "starting")
         guides = denoise.render_guides(loaded.scene, plan.seed) if settings.denoise else None
         if guides:
-            seconds = f"{guides.seconds:.2g} s ({denoise.GUIDE_SPP} spp)"
+            seconds = f"{guides.seconds:.2g} s"
             found.notes.append(f"The guides took {seconds}, counted for nobody.")
         shared = reference, guides
         shown = elsewhere.of_scene(settings.images, found.name)
