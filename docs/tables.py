@@ -1,0 +1,2 @@
+def with_age(text, root):
+    return text
