@@ -27,7 +27,7 @@ MODULES = ("mi_neural.explore.session", "mi_neural.explore.views", "mi_neural.ca
            "mi_neural.scenes")  # fmt: skip
 #: Pictures of `scenes` that pages of `docs` show.
 PICTURES = ("ajar_door.png", "gallery.webp", "moving_light.webp")
-LINK = re.compile(r"`mi-neural doc (\w+)`")
+LINK = re.compile(r"`mi-neural doc ([a-z_]\w*)`")
 
 
 def linked(markdown: str, folder: str = "") -> str:
@@ -44,9 +44,9 @@ def linked(markdown: str, folder: str = "") -> str:
     return LINK.sub(target, markdown)
 
 
-def guide(name: str) -> str:
-    """A guide with links in place of commands, and the age of its tables."""
-    return tables.with_age(linked(pages.guide(name)), ROOT)
+def page(markdown: str) -> str:
+    """A page with links in place of commands, pictures beside it, and the age of its tables."""
+    return tables.with_age(linked(markdown), ROOT).replace("](../scenes/", "](")
 
 
 def plugin(name: str) -> str:
@@ -117,9 +117,9 @@ def stage(folder: Path) -> None:
         file.write_text(text, encoding="utf-8")
 
     for file in (ROOT / "docs").glob("*.md"):
-        put(file.name, file.read_text(encoding="utf-8"))
+        put(file.name, page(file.read_text(encoding="utf-8")))
     for name in pages.guides():
-        put(f"{name}.md", guide(name))
+        put(f"{name}.md", page(pages.guide(name)))
     for name in pages.plugins():
         put(f"plugins/{name}.rst", plugin(name))
     for name, text in python().items():
