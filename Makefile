@@ -72,7 +72,7 @@ $(DOCS): $(STAMP)
 
 docs: $(DOCS)  ## the manual as HTML: out/docs/index.html
 	$(BIN)/python docs/stage.py out/docs_source
-	$(BIN)/python -m sphinx -q -n -W --keep-going -c docs out/docs_source out/docs
+	$(BIN)/sphinx-build -q -n -W --keep-going -c docs out/docs_source out/docs
 	@echo "Open out/docs/index.html"
 
 tables: $(STAMP)  ## write the tables of README and manual anew from docs/results/*.json

@@ -205,7 +205,7 @@ def age(results: dict, root: Path) -> str:
 
 
 def with_age(text: str, root: Path) -> str:
-    """A page whose tables and figures say where they are older than their code; for `make docs`, not for the sources."""
+    """A page whose tables and figures say where they are older than their code, for `make docs` alone."""
 
     def added(found: re.Match) -> str:
         sentence = age(read(found[2]), root)
