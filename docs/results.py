@@ -123,7 +123,10 @@ def _same(value, wanted) -> bool:
 
 def _digits(value: float | None, digits: str) -> Number | None:
     """A number with so many digits: `3g` or `.3f`, as in a format string."""
-    return None if value is None else Number(format(value, digits if "." in digits else f".{digits}"))
+    if value is None:
+        return None
+    text = format(value, digits if "." in digits else f".{digits}")
+    return Number(f"{float(text):.0f}" if "e+" in text else text)
 
 
 if __name__ == "__main__":

@@ -47,6 +47,11 @@ def test_numbers_of_a_comparison_fill_the_table(results, table):
     assert table["date"] > "2026-01-01"
 
 
+def test_numbers_have_the_digits_that_were_asked_for(results):
+    asked = ((0.08999, ".3f", "0.090"), (1234.0, "3g", "1230"), (2e-5, "2g", "2e-05"), (4.5, "2g", "4.5"))
+    assert [results._digits(value, digits) for value, digits, _ in asked] == [text for _, _, text in asked]
+
+
 def test_a_missing_integrator_is_named(results, table):
     with pytest.raises(results.ResultsError, match="0 groups of the comparison have scene a, label new"):
         results.fill(table, {"groups": [GROUPS[0], GROUPS[2]], "environment": ENVIRONMENT}, "abc1234", None)
