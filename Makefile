@@ -7,7 +7,7 @@ STAMP  := $(VENV)/mi_neural.stamp
 TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture bench gallery gallery-pictures docs gpu notebooks test test-notebooks stress lint clean
+.PHONY: help demo picture bench gallery gallery-pictures docs tables results gpu notebooks test test-notebooks stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -63,9 +63,23 @@ gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light
 gallery-pictures: gallery  ## the README's pictures, of the gallery
 	$(BIN)/python -m mi_neural.bench.gallery out/gallery --compact scenes/gallery.webp --animation scenes/moving_light.webp
 
-docs: pyproject.toml | $(STAMP)  ## the manual as HTML: out/docs/index.html
+# Python needs no network for it once the environment is made; warnings are errors, dead links among them.
+DOCS := $(VENV)/docs.stamp
+
+$(DOCS): $(STAMP)
 	$(BIN)/python -m pip install --quiet -e '.[docs]'
-	$(BIN)/mi-neural doc --html out/docs
+	@touch $@
+
+docs: $(DOCS)  ## the manual as HTML: out/docs/index.html
+	$(BIN)/python docs/stage.py out/docs_source
+	$(BIN)/sphinx-build -q -n -W --keep-going -c docs out/docs_source out/docs
+	@echo "Open out/docs/index.html"
+
+tables: $(STAMP)  ## write the tables of README and manual anew from docs/results/*.json
+	$(BIN)/python docs/tables.py
+
+results: $(STAMP)  ## measure tables again, those that a command makes (ONLY=NAME: one of them); goes on where stopped
+	$(BIN)/python docs/results.py $(if $(ONLY),--only $(ONLY))
 
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(TESTS)  ## the default tests, a few minutes on two cores

@@ -39,7 +39,7 @@ class NVCLightSampler(LightSampler):
        - |int|
        - Parts of the environment that the network has an output for each, beside ``outputs``; 0: the environment is one
          light, and Mitsuba chooses a direction in it. 32 of them have a quarter less noise in a room lit through
-         windows, and cost as much in time (README). (Default: 0)
+         windows, and cost as much in time (``mi-neural doc measured``). (Default: 0)
      * - candidates
        - |int|
        - Lights of a cluster that one is resampled from. (Default: 16)

@@ -16,7 +16,7 @@ from mi_neural.render.surface import scene_is_glossy, surface_of
 #: Queries a camera sample, at its first surface and at its end.
 QUERIES = 2.0
 #: A denoiser removes as much noise as so many times the samples, and its images have the least FLIP with this spread
-#: threshold (manual, 6_measured).
+#: threshold (manual, measured).
 DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
 #: Samples a pixel at which the spread threshold has grown to 1.
 FULL = 256

@@ -449,7 +449,7 @@ NIRCTwoLevelIntegrator.__doc__ = (
        - |bool|
        - Choose the one traced direction among the ``cache_samples`` that were asked, in proportion to f cos L plus a
          defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Was worth
-         its time in one of seven scenes measured (README). (Default: false)
+         its time in one of seven scenes measured (``mi-neural doc speed``). (Default: false)
     """
     + SHARED_KEYS.strip("\n")
     + r"""

@@ -6,13 +6,12 @@ import shlex
 
 import mitsuba as mi
 import pytest
-import typer
 from rich.console import Console
 from test_structure import plugin_class, table_rows
 from typer.testing import CliRunner
 
 from mi_neural import cli, emitters, integrators
-from mi_neural.manual import mathtext, pages, site, terminal
+from mi_neural.manual import directives, mathtext, pages, terminal
 
 PLUGINS = list(pages.plugins())
 GUIDES = list(pages.guides())
@@ -42,7 +41,7 @@ def test_every_plugin_has_a_page_with_all_its_keys(name):
     for key in page.keys:
         assert re.search(rf"^ ?{re.escape(key.name)}\b|^\(none\)", text, re.M), f"{key.name} starts no line"
         if key.name != "(none)":
-            assert set(key.type.split(" or ")) <= set(pages.TYPES) and key.text
+            assert set(key.type.split(" or ")) <= set(directives.TYPES) and key.text
     assert f'type="{name}"' in text and f'"type": "{name}"' in re.sub(r"\s+", " ", text), "XML and Python to paste"
     assert not re.search(r":\w+:`|\.\. \w+|\\frac|\\sum|``|\|int\|", text), "markup is left in the text"
 
@@ -157,22 +156,3 @@ def test_modules_that_guides_and_readme_run_exist(root):
     texts = [pages.guide(name) for name in GUIDES] + [(root / "README.md").read_text(encoding="utf-8")]
     for module in {m for text in texts for m in re.findall(r"python -m (mi_neural[\w.]+)", text)}:
         assert find_spec(module) is not None, module
-
-
-# ---------------------------------------------------------------- site
-
-
-def test_site_has_all_pages_and_no_dead_links(tmp_path):
-    program = typer.main.get_command(cli.app)
-    site.write(tmp_path, program.context_class(program, info_name="mi-neural"), python=False)
-    names = {f.stem for f in tmp_path.glob("*.html")}
-    assert names == {*PLUGINS, *GUIDES, "index", "commands"}
-    for file in tmp_path.glob("*.html"):
-        text = file.read_text(encoding="utf-8")
-        assert "system-message" not in text
-        for target in re.findall(r'(?:href|src)="([^"#:]+)"', text):
-            assert (tmp_path / target).exists(), f"{file.name} leads to {target}"
-    assert "<math" in (tmp_path / "nirc.html").read_text(encoding="utf-8")
-    commands = (tmp_path / "commands.html").read_text(encoding="utf-8")
-    for command in cli.app.registered_commands:
-        assert f"Usage: mi-neural {command.name or command.callback.__name__}" in commands

@@ -1,5 +1,7 @@
 """The visibility cache: what it learns, and how."""
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -107,6 +109,20 @@ def test_loss_falls(wall):
 def test_statistics_count_the_steps(wall):
     s = wall[2].statistics
     assert s["visibility_steps"] == wall[2].steps == 100 and s["seconds_visibility"] > 0
+
+
+def test_time_of_training_is_counted_once():
+    """A clock that ticks at each reading: reading what the steps found is within the time of training."""
+    scene = wall_scene()
+    table = LightTable(scene)
+    cache = VisibilityCache(VisibilityTraining(n_points=64))
+    cache.train(scene, scene.sensors()[0], table, make_groups(table, 32))
+    before, ticks = cache.statistics["seconds_visibility"], itertools.count()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("time.perf_counter", lambda: float(next(ticks)))
+        cache.train(scene, scene.sensors()[0], table, make_groups(table, 32), frames=16)
+        passed = next(ticks)
+    assert 0 < cache.statistics["seconds_visibility"] - before < passed
 
 
 def test_equal_seeds_give_equal_weights_and_others_do_not():

@@ -1,4 +1,5 @@
-"""One self-contained HTML page of a comparison: contents, tables, curves, pictures that are zoomed together.
+"""One self-contained HTML page of a comparison. Each scene opens with what is seen at once: pictures side by side,
+which are zoomed together, and one plot of the error over time. Tables and more curves follow.
 
 The page holds everything: pictures as data URLs, curves as inline SVG, style and script inline. It loads nothing.
 """
@@ -18,7 +19,18 @@ from mi_neural.image import exr
 from . import curves
 from .benchmark import Picture
 from .reference import Reference
-from .report import Report, SceneResult, html_table, name_of, number, split_table, summary, table
+from .report import (
+    Report,
+    SceneResult,
+    best,
+    best_of_summary,
+    html_table,
+    name_of,
+    number,
+    split_table,
+    summary,
+    table,
+)
 
 #: What the modes of rows mean, in the order in which a page shows them.
 MODE_TEXT = {
@@ -33,9 +45,13 @@ CURVE_TEXT = {
     "unfinished": "Error of the longest image while it was rendered, after 1, 2, 4, ... samples",
     "steady": "Error of frames over their time",
 }
-#: Bytes of pixels up to which a page's pictures are kept exactly; beyond, they are JPEG.
-EXACT_BYTES = 30e6
-JPEG_QUALITY = 88
+#: Bytes of a page that the pictures of a scene may take, so that a page of three scenes stays below 8 MB: a third of
+#: that, without 0.4 MB of curves and tables. The files beside the page hold the pictures exactly.
+SCENE_BYTES = 8e6 / 3 - 0.4e6
+#: Qualities of WebP that are tried for a picture; where none is small enough, the picture is halved.
+QUALITIES = (90, 75, 60, 40)
+#: Below so many pixels along its shorter side no picture is halved.
+SMALLEST = 64
 
 
 def style() -> str:
@@ -49,12 +65,25 @@ def curves_of(scene: SceneResult) -> dict[str, str]:
     return {kind: svg for kind, svg in drawn.items() if svg}
 
 
+def drawings(report: Report) -> dict[tuple[str, str], str]:
+    """Drawings of all scenes, by the names of scene and drawing."""
+    return {(scene.name, kind): svg for scene in report.scenes for kind, svg in curves_of(scene).items()}
+
+
 # ------------------------------------------------------------------------------------------------------------------
 # Pictures
 
 
-def entry(picture: Picture, exposure: float, exact: bool = True) -> dict[str, object]:
-    """What the viewer shows of a picture: name, caption, by what it can be chosen, image and FLIP map."""
+def picture_bytes(n_kinds: int) -> int:
+    """Bytes that an image may take where a scene has so many pictures, each with its FLIP map, and a reference."""
+    return int(0.75 * SCENE_BYTES / (1 + 2 * n_kinds))  # a data URL has four letters for three bytes
+
+
+def entry(picture: Picture, exposure: float, most: int | None = None) -> dict[str, object]:
+    """What the viewer shows of a picture: name, caption, by what it can be chosen, image and FLIP map.
+
+    most   bytes of an image, see :func:`data_url`
+    """
     row = picture.row
     kind = row.mode + (f" {row.budget_seconds:g} s" if row.budget_seconds else "")
     errors = [
@@ -68,17 +97,17 @@ def entry(picture: Picture, exposure: float, exact: bool = True) -> dict[str, ob
         "integrator": row.label,
         "kind": kind,
         "denoiser": "denoised" if row.denoised else "raw",
-        "image": data_url(exr.to_srgb8(picture.rgb, exposure), exact),
-        "error": None if picture.flip_map is None else data_url(flip_colours(picture.flip_map), exact),
+        "image": data_url(exr.to_srgb8(picture.rgb, exposure), most),
+        "error": None if picture.flip_map is None else data_url(flip_colours(picture.flip_map), most),
     }
 
 
-def reference_entry(reference: Reference, exposure: float, exact: bool = True) -> dict[str, object]:
+def reference_entry(reference: Reference, exposure: float, most: int | None = None) -> dict[str, object]:
     """The reference as the viewer's first picture."""
     spp, error = reference.metadata.get("spp"), reference.standard_error()
     caption = [f"{spp} spp"] if spp else []
     caption += [f"standard error of a pixel {100 * error:.2g} %"] if error is not None else []
-    image = data_url(exr.to_srgb8(reference.rgb, exposure), exact)
+    image = data_url(exr.to_srgb8(reference.rgb, exposure), most)
     return {"name": "reference", "caption": ", ".join(caption), "image": image, "error": None}
 
 
@@ -89,15 +118,32 @@ def flip_colours(flip_map: np.ndarray) -> np.ndarray:
     return colormaps["magma"](np.clip(flip_map, 0.0, 1.0), bytes=True)[..., :3].copy()
 
 
-def data_url(rgb8: np.ndarray, exact: bool = True) -> str:
-    """Pixels as a data URL: PNG, or JPEG where they need not be `exact`."""
-    if exact:
+def data_url(rgb8: np.ndarray, most: int | None = None) -> str:
+    """Pixels as a data URL: PNG, or with `most` WebP of at most so many bytes, exact where that is small enough."""
+    if most is None:
         return "data:image/png;base64," + base64.b64encode(exr.png_bytes(rgb8)).decode()
+    return "data:image/webp;base64," + base64.b64encode(_webp(rgb8, most)).decode()
+
+
+def _webp(rgb8: np.ndarray, most: int) -> bytes:
     from PIL import Image  # comes with matplotlib
 
-    buffer = io.BytesIO()
-    Image.fromarray(rgb8).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+    image = Image.fromarray(rgb8)
+
+    def encoded(**options) -> bytes:
+        buffer = io.BytesIO()
+        image.save(buffer, "WEBP", method=2, **options)
+        return buffer.getvalue()
+
+    if rgb8.nbytes < 8 * most and len(exact := encoded(lossless=True, quality=20)) <= most:
+        return exact
+    while True:
+        for quality in QUALITIES:
+            if len(found := encoded(quality=quality)) <= most:
+                return found
+        if min(image.size) < 2 * SMALLEST:
+            return found
+        image = image.reduce(2)
 
 
 # ------------------------------------------------------------------------------------------------------------------
@@ -137,37 +183,39 @@ def _notes(notes: list[str]) -> str:
     return f'<ul class="notes">{"".join(f"<li>{html.escape(n)}</li>" for n in notes)}</ul>' if notes else ""
 
 
-def _wide(cells: list[list[str]]) -> str:
-    return f'<div class="wide">{html_table(cells)}</div>'
+def _wide(cells: list[list[str]], marked: set[tuple[int, int]] = frozenset()) -> str:
+    return f'<div class="wide">{html_table(cells, marked)}</div>'
 
 
 def _summary(report: Report) -> str:
     parts = [
         '<section id="summary"><h2>Summary</h2>',
         "<p>Trimmed relMSE / FLIP. Factor: by how much trimmed relMSE is below that of the first integrator, denoised "
-        "or not as in this line; geometric mean over the scenes.</p>",
+        "or not as in this line; geometric mean over the scenes. The least error of a column is marked.</p>",
     ]
     for title, cells in summary(report):
-        parts.append(f"<h3>{html.escape(title)}</h3>{_wide(cells)}")
+        parts.append(f"<h3>{html.escape(title)}</h3>{_wide(cells, best_of_summary(cells))}")
     return "\n".join(parts) + "</section>"
 
 
 def _scene(scene: SceneResult, k: int, drawn: dict[str, str]) -> str:
     parts = [f'<section id="scene-{k}"><h2>{html.escape(scene.name)}, {scene.size[0]}x{scene.size[1]}</h2>']
+    if scene.entries:
+        parts.append(
+            f'<div class="viewer" id="viewer-{k}"></div><p class="about">Click a picture, then: wheel or double-click '
+            "zooms, dragging moves, all pictures follow.</p>"
+        )
+    if overview := curves.overview(scene.rows):
+        parts.append(f'<h3>Error over time</h3><div class="curves overview">{overview}</div>')
     parts.append(_notes(scene.notes))
     for mode, text in MODE_TEXT.items():
         if of_mode := [g for g in scene.groups if g.first.mode == mode]:
-            parts.append(f"<h3>{html.escape(text)}</h3>{_wide(table(of_mode))}")
+            parts.append(f"<h3>{html.escape(text)}</h3>{_wide(table(of_mode), best(of_mode))}")
     if frames := split_table(scene.groups):
         parts.append(
             "<h3>Where the time of a one-sample frame goes, in ms</h3>" + _wide(frames) + '<p class="about">'
             "Kernels by Dr.Jit's own clocks; one fused kernel holds queries and tracing, so queries are their number "
             "times what one costs in a kernel of its own. Python: wall time in which no kernel runs.</p>"
-        )
-    if scene.entries:
-        parts.append(
-            f'<h3>Pictures</h3><div class="viewer" id="viewer-{k}"></div><p class="about">Click a picture, then: wheel '
-            "or double-click zooms, dragging moves, all pictures follow.</p>"
         )
     for kind, svg in drawn.items():
         parts.append(f'<h3>{html.escape(CURVE_TEXT[kind])}</h3><div class="curves">{svg}</div>')

@@ -34,6 +34,14 @@ COLUMNS = (
     ("flicker", lambda g: interval(g, "flicker")),
     ("peak MiB", lambda g: number(_rounded(g.mean("peak_mib")))),
 )
+#: Columns in which one value is the best of those of one budget, and whether that is the least or the largest.
+BEST = {
+    "spp": (lambda g: g.mean("spp"), max), "ns/sample": (lambda g: g.mean("ns_per_sample"), min),
+    "relMSE trimmed": (lambda g: g.mean("relmse_trimmed"), min), "bias²": (lambda g: g.squared_bias, min),
+    "variance": (lambda g: g.variance, min), "relMSE": (lambda g: g.mean("relmse"), min),
+    "FLIP": (lambda g: g.mean("flip"), min), "flicker": (lambda g: g.mean("flicker"), min),
+    "peak MiB": (lambda g: g.mean("peak_mib"), min),
+}  # fmt: skip
 #: Parts of a frame, as :class:`.split.Split` names them.
 PARTS = ("train", "query", "trace", "film", "python")
 #: Fields of a row that a table of numbers has no room for.
@@ -75,6 +83,34 @@ def table(groups: Iterable[Group]) -> list[list[str]]:
     cells = [[name for name, _ in columns], *([cell(g) for _, cell in columns] for g in groups)]
     kept = [k for k in range(len(columns)) if any(line[k] for line in cells[1:])]
     return [[line[k] for k in kept] for line in cells]
+
+
+def best(groups: Iterable[Group]) -> set[tuple[int, int]]:
+    """Places (line, column) in :func:`table` of the best values among the lines of one budget, where they differ."""
+    groups = list(groups)
+    places = set()
+    for column, heading in enumerate(table(groups)[0]):
+        if heading not in BEST:
+            continue
+        value, which = BEST[heading]
+        for budget in dict.fromkeys(g.first.budget_seconds for g in groups):
+            found = {k: v for k, g in enumerate(groups, 1) if g.first.budget_seconds == budget
+                     and (v := value(g)) is not None}  # fmt: skip
+            if len(set(found.values())) > 1:
+                places |= {(k, column) for k, v in found.items() if v == which(found.values())}
+    return places
+
+
+def best_of_summary(cells: list[list[str]]) -> set[tuple[int, int]]:
+    """Places (line, column) in a :func:`summary` of each scene's least trimmed relMSE and of the largest factor."""
+    places = set()
+    for column in range(1, len(cells[0])):
+        texts = {k: line[column].partition(" ")[0] for k, line in enumerate(cells) if k}
+        found = {k: float(text) for k, text in texts.items() if text}
+        which = max if cells[0][column] == "factor" else min
+        if len(set(found.values())) > 1:
+            places |= {(k, column) for k, v in found.items() if v == which(found.values())}
+    return places
 
 
 def split_table(groups: Iterable[Group]) -> list[list[str]]:
@@ -170,14 +206,15 @@ def markdown(cells: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
 
 
-def html_table(cells: list[list[str]]) -> str:
-    """A table, its headings first, in HTML."""
-    head, *body = cells
+def html_table(cells: list[list[str]], marked: set[tuple[int, int]] = frozenset()) -> str:
+    """A table, its headings first, in HTML; cells at the places (line, column) of `marked` have the class `best`."""
 
-    def line(cells: list[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
+    def cell(k: int, column: int, text: str) -> str:
+        tag, kind = "td" if k else "th", ' class="best"' if (k, column) in marked else ""
+        return f"<{tag}{kind}>{html.escape(text)}</{tag}>"
 
-    return "<table>" + line(head, "th") + "".join(line(cells, "td") for cells in body) + "</table>"
+    lines = ("".join(cell(k, column, text) for column, text in enumerate(line)) for k, line in enumerate(cells))
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
 def name_of(row: Row) -> str:

@@ -206,9 +206,8 @@ class Suite:
             terminal.announce(f"{len(done.rows)} rows are there already, of the same command interrupted")
         exposure = exr.automatic_exposure(reference.rgb)
         exr.write_png(folder / "reference.png", reference.rgb, exposure)
-        n_pixels = loaded.size[0] * loaded.size[1]
-        exact = 2 * 3 * n_pixels * settings.kinds() * len(self.files) < page.EXACT_BYTES
-        found.entries.append(page.reference_entry(reference, exposure, exact))
+        most = page.picture_bytes(settings.kinds())
+        found.entries.append(page.reference_entry(reference, exposure, most))
 
         def keep(picture: benchmark.Picture) -> None:
             row = picture.row
@@ -219,7 +218,7 @@ class Suite:
             found.rows.append(row)
             if picture.rgb is not None and row.repeat == 0:
                 exr.write_png(folder / (terminal.slug(row) + ".png"), picture.rgb, exposure)
-                found.entries.append(page.entry(picture, exposure, exact))
+                found.entries.append(page.entry(picture, exposure, most))
 
         self.bars("guides for the denoiser" if settings.denoise else "starting")
         guides = denoise.render_guides(loaded.scene, plan.seed) if settings.denoise else None
@@ -266,7 +265,7 @@ def write(found: report.Report, folder: Path) -> None:
     exr.write_text(folder / "results.json", json.dumps(report.results(found), indent=1) + "\n")
     exr.write_text(folder / "results.csv", report.comma_separated(found.rows))
     exr.write_text(folder / "table.md", report.tables(found))
-    drawn = {(scene.name, kind): svg for scene in found.scenes for kind, svg in page.curves_of(scene).items()}
+    drawn = page.drawings(found)
     for (name, kind), svg in drawn.items():
         of_scene = re.sub(r"[^\w.-]+", "_", name) + "_" if len(found.scenes) > 1 else ""
         exr.write_text(folder / f"curves_{of_scene}{kind}.svg", svg)

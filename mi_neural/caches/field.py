@@ -21,7 +21,7 @@ __all__ = ["FILE_VERSION", "CacheFileError", "Field", "FieldShape", "TrainedFiel
 LARGEST = {"n_levels": 32, "n_features": 16, "hashmap_size": 2**24, "base_resolution": 2**12, "width": 1024,
            "n_hidden": 32, "n_outputs": 1024}  # fmt: skip
 #: Points are looked up so many cells of the finest level above their surface: both sides of a thin wall are one point,
-#: and lifted they are apart (manual, 6_measured).
+#: and lifted they are apart (manual, measured).
 LIFT = 2.0
 
 

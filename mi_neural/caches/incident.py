@@ -42,12 +42,12 @@ class Training:
 
     n_paths          training paths
     n_vertices       vertices of a path; it ends in the cache itself (self-training). Long suffixes carry light through
-                     a closed room in a few frames and do not build on the cache's own errors (manual, 6_measured)
+                     a closed room in a few frames and do not build on the cache's own errors (manual, measured)
     n_tail           cache queries at the end of a path
     n_local          queries that estimate the local mean of `loss.local_relative_l2`
     epsilon          of that loss, over the squared mean target of the scene. Where the local mean, itself a prediction,
                      is the whole norm, targets count less when it overshoots, and the cache drifts: a room lit through
-                     a slit +8 to +14 % after 200 to 600 steps with 0.03, within 1 % with 10 (manual, 6_measured)
+                     a slit +8 to +14 % after 200 to 600 steps with 0.03, within 1 % with 10 (manual, measured)
     learning_rate    of Adam, at the start; see `rate`
     ema_decay        longest horizon of the averaged copy: 1 / (1 - ema_decay) steps
     last_rate        share of the learning rate that it falls to

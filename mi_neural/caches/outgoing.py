@@ -37,7 +37,7 @@ ALBEDO_MIN = 0.05
 TARGET_MAX = 1e4
 #: Of the relative loss, over the squared scale (Müller et al. 2021).
 EPSILON = 1e-2
-#: The learning rate of this network over that of the incident cache, trained on the same paths (manual, 6_measured)
+#: The learning rate of this network over that of the incident cache, trained on the same paths (manual, measured)
 RATE = 6.0
 #: Bins of the roughness, encoded as 1 - e^-roughness.
 ROUGHNESS_BINS = 4
@@ -319,7 +319,7 @@ class OutgoingTraining(Training):
     """Constants of one training step; those of :class:`~mi_neural.caches.incident.Training`, and
 
     n_paths           training paths. In equal time half as many at twice the rate learn as well or better (manual,
-                      6_measured)
+                      measured)
     epsilon           of the relative loss, over the squared scale. Relative squared error of the cache seen directly,
                       300 steps in a stairwell: 0.070 with 0.01, 0.069 with 0.1, 0.066 with 1
     n_records         places for records in a step; more are left out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,23 +14,11 @@ from mi_neural.commands.options import readable
 
 @readable
 def doc(
-    context: typer.Context,
     page: Annotated[str | None, typer.Argument(metavar="[PAGE]", help="a plugin or a guide; none: the list")] = None,
-    html: Annotated[Path | None, typer.Option(metavar="DIR", help="write the whole manual there as HTML")] = None,
 ) -> None:
     """The manual page of a plugin (`mi-neural doc nirc`) or a guide (`mi-neural doc choose`)."""
     from mi_neural.manual import pages
     from mi_neural.manual import terminal as shown
-
-    if html is not None:
-        if page is not None:
-            raise InputError("--html writes all pages: leave out the page")
-        from mi_neural.manual import site
-
-        terminal.set_variant(terminal.DEFAULT_VARIANT)
-        site.write(html, context.find_root())
-        terminal.out.print(f"wrote {html / 'index.html'}", soft_wrap=True, markup=False)
-        return
 
     if page in pages.guides():
         terminal.out.print(shown.guide(pages.guide(page)))

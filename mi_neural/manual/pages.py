@@ -6,13 +6,7 @@ import difflib
 import inspect
 import re
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-
-#: The kinds of values a key takes, written as ``|int|`` in the tables.
-TYPES = ("int", "float", "bool", "string", "emitter", "bsdf", "texture", "spectrum", "transform", "point", "vector")
-#: Roles of Sphinx that stand for a name in code here.
-NAMING_ROLES = ("monosp", "class", "meth", "func", "mod", "ref", "attr")
 
 _GUIDES = Path(__file__).resolve().parent
 
@@ -79,8 +73,10 @@ def parse(name: str, kind: str, docstring: str) -> Page:
     from docutils.core import publish_doctree
     from docutils.utils import SystemMessage
 
-    _register()
-    text = inspect.cleandoc(docstring) + "\n\n" + "".join(f".. |{t}| replace:: {t}\n" for t in TYPES)
+    from mi_neural.manual import directives
+
+    directives.register()
+    text = inspect.cleandoc(docstring) + directives.SUBSTITUTIONS
     settings = {"report_level": 2, "halt_level": 2, "warning_stream": False, "input_encoding": "unicode"}
     try:
         tree = publish_doctree(text, source_path=name, settings_overrides=settings)
@@ -98,57 +94,6 @@ def _keys(tree):
             name, kind, text = (cell.astext().replace("\n", " ") for cell in row.children)
             default = re.search(r"\(Default: (.*)\)\s*$", text)
             yield Key(name, kind, text[: default.start()].strip() if default else text, default[1] if default else "")
-
-
-@cache
-def _register() -> None:
-    """Teach docutils what Mitsuba's docstrings use and it has not."""
-    from docutils import nodes
-    from docutils.parsers.rst import Directive, directives, roles
-    from docutils.statemachine import StringList
-
-    class Parameters(Directive):
-        """`.. pluginparameters::`: a list of rows (key, type, text), as a table of class `parameters`."""
-
-        has_content = True
-
-        def run(self):
-            # Rows may come from several strings with different indents; what counts is the bullets
-            lines = [re.sub(r"^\s*(\* -|-)?(?= |$)\s*", lambda m: {"* -": "* - ", "-": "  - "}.get(m[1], "    "), line)
-                     for line in self.content]  # fmt: skip
-            text = [".. list-table::", "    :class: parameters", "    :widths: 18 8 74", ""]
-            holder = nodes.Element()
-            self.state.nested_parse(StringList([*text, *("    " + line for line in lines)], "table"), 0, holder)
-            return holder.children
-
-    class Tabs(Directive):
-        """`.. tabs::`: its tabs one after the other."""
-
-        has_content = True
-
-        def run(self):
-            holder = nodes.container(classes=["tabs"])
-            self.state.nested_parse(self.content, self.content_offset, holder)
-            return [holder]
-
-    class CodeTab(Directive):
-        """`.. code-tab:: xml`: a block of code in that language."""
-
-        has_content, required_arguments, optional_arguments = True, 1, 1
-
-        def run(self):
-            text = "\n".join(self.content)
-            return [nodes.literal_block(text, text, classes=["code", self.arguments[0]])]
-
-    for name, directive in (("pluginparameters", Parameters), ("tabs", Tabs), ("code-tab", CodeTab)):
-        directives.register_directive(name, directive)
-
-    def naming(role, rawtext, text, lineno, inliner, options=None, content=None):
-        shown = text.rpartition(".")[2] if text.startswith("~") else text
-        return [nodes.literal(rawtext, shown)], []
-
-    for name in NAMING_ROLES:
-        roles.register_local_role(name, naming)
 
 
 # ------------------------------------------------------------------------------------------------------------------

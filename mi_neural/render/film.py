@@ -12,7 +12,7 @@ from .frozen import can_freeze, disturbed, undisturbed
 from .sampling import PathSampler
 from .spectrum import film_colour
 
-#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (manual, 6_measured).
+#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (manual, measured).
 PASS_SAMPLES = 2**20
 #: Neighbouring pixels whose samples lie side by side: the lanes of a packet of AVX-512, half a warp.
 PACKET = 16

@@ -1,0 +1,137 @@
+"""Measure tables of README and manual again: `python docs/results.py`, or `make results`.
+
+Runs the command of each table whose file says how to read it (`extract`), writes its numbers into `docs/results`, and
+the tables into the Markdown. Of other tables it prints the command. `$OUT` in a command is a folder in `out/results`,
+`$SCENES` the folder of the public scenes, from the environment. Interrupted, it goes on from there when typed again:
+what was measured of a version is not measured again.
+
+`extract` names the groups of the `results.json` that `mi-neural compare` writes. A cell is the group that has all that
+its row and its column say (`rows`, `columns`: null for one that stays as it is): `scene`, `label`, `mode`,
+`budget_seconds`, `denoised`. `values` are the fields to show and how many digits they have; `title` renames a column.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import hashlib
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import tables
+from tables import ROOT, Number, ResultsError
+
+OUT = ROOT / "out/results"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", metavar="NAME", help="one table")
+    parser.add_argument("--machine", metavar="TEXT", help="what the captions say of this machine")
+    asked = parser.parse_args(arguments)
+    names = [asked.only] if asked.only else sorted(file.stem for file in tables.RESULTS.glob("*.json"))
+    for name in names:
+        found = tables.read(name)
+        if why := not_run(found):
+            print(f"{name}: {why}: {found['command'] or 'no command'}")
+            continue
+        measured = run(found)
+        fill(found, measured, version(found["paths"]), asked.machine)
+        (tables.RESULTS / f"{name}.json").write_text(tables.encoded(found), encoding="utf-8")
+        print(f"{name}: measured")
+    tables.main()
+
+
+def not_run(found: dict) -> str:
+    """Why a table is not measured here; '' where it is."""
+    if not found["command"]:
+        return "its script was not kept"
+    if "extract" not in found:
+        return "nothing reads its numbers yet; type by hand"
+    if "$SCENES" in found["command"] and not os.environ.get("SCENES"):
+        return "needs the public scenes; set SCENES to their folder and type again"
+    return ""
+
+
+def version(paths: list[str]) -> str:
+    """The commit that is measured. Raises `ResultsError` where the code has changes that no commit has."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    if changed := git("status", "--porcelain", "--", *paths):
+        raise ResultsError(f"numbers belong to a commit, but this code was changed; commit or stash first:\n{changed}")
+    return git("rev-parse", "--short", "HEAD")
+
+
+def run(found: dict) -> dict:
+    """What the command of a table measures; tables of one command share one run."""
+    commit, command = version(found["paths"]), found["command"]
+    out = OUT / hashlib.sha256(f"{commit} {command}".encode()).hexdigest()[:12]
+    done = out / "done"
+    if not done.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        words = [word.replace("$OUT", str(out)).replace("$SCENES", os.environ.get("SCENES", ""))
+                 for word in shlex.split(command)]  # fmt: skip
+        print("running:", shlex.join(words), flush=True)
+        if words[0] == "mi-neural":  # of this environment
+            program = Path(sys.executable).with_name("mi-neural")
+            words[:1] = [str(program)] if program.exists() else [
+                sys.executable, "-c", "from mi_neural.cli import main; main()"]  # fmt: skip
+        status = subprocess.run(words, cwd=ROOT, env={**os.environ, "PYTHONSAFEPATH": "1"}).returncode
+        if status:
+            raise ResultsError(f"the command ended with status {status}; type the same again to go on from there")
+        done.write_text(f"{commit}\n{command}\n", encoding="utf-8")
+    return json.loads((out / "results.json").read_text(encoding="utf-8"))
+
+
+def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
+    """Put the numbers of `measured` into the table `found`, with their version, date and machine."""
+    extract = found["extract"]
+    cells = [list(row["cells"]) for row in tables.rows(found)]
+    for k, column in enumerate(extract["columns"]):
+        if column is None:
+            continue
+        found["columns"][k] = column.get("title", found["columns"][k])
+        for line, row in zip(cells, extract["rows"], strict=True):
+            line[k] = cell({**extract, **column, **row}, measured["groups"])
+    where = measured["environment"]
+    found.update(rows=cells, commit=commit, date=datetime.date.today().isoformat(), mitsuba=where["mitsuba"],
+                 machine=machine or f"{where['cores']} cores ({where['cpu']})")  # fmt: skip
+
+
+def cell(wanted: dict, groups: list[dict]) -> object:
+    """The numbers of the one group that has all that `wanted` says; '' where it has none of them."""
+    keys = [key for key in ("scene", "label", "mode", "budget_seconds", "denoised") if key in wanted]
+    found = [g for g in groups if all(_same(g[key], wanted[key]) for key in keys)]
+    if len(found) != 1:
+        shown = ", ".join(f"{key} {wanted[key]}" for key in keys)
+        raise ResultsError(f"{len(found)} groups of the comparison have {shown}; there must be one")
+    numbers = [_digits(found[0][name], digits) for name, digits in wanted["values"].items()]
+    if any(number is None for number in numbers):
+        return ""
+    return numbers if len(numbers) > 1 else numbers[0]
+
+
+def _same(value, wanted) -> bool:
+    return float(value) == float(wanted) if isinstance(wanted, Number) else value == wanted
+
+
+def _digits(value: float | None, digits: str) -> Number | None:
+    """A number with so many digits: `3g` or `.3f`, as in a format string."""
+    if value is None:
+        return None
+    text = format(value, digits if "." in digits else f".{digits}")
+    return Number(f"{float(text):.0f}" if "e+" in text else text)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parent))
+    try:
+        main()
+    except ResultsError as error:
+        sys.exit(str(error))

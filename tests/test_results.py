@@ -1,0 +1,90 @@
+"""docs/results.py: numbers of a comparison into a table."""
+
+import importlib
+import json
+import sys
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def results(root):
+    sys.path.insert(0, str(root / "docs"))
+    try:
+        yield importlib.import_module("results")
+    finally:
+        sys.path.remove(str(root / "docs"))
+
+
+@pytest.fixture
+def table(results):
+    """A table of two scenes and two integrators."""
+    text = """{"title": "", "commit": "a", "date": "2026-01-01", "machine": "m", "mitsuba": "3", "paths": ["docs"],
+        "command": "x", "columns": ["scene", "`path`", "`old`"], "formats": {"2": "{} / {}"},
+        "extract": {"values": {"relmse_trimmed": "3g", "flip": ".3f"}, "mode": "one-shot", "denoised": true,
+            "rows": [{"scene": "a", "budget_seconds": 2}, {"scene": "b", "budget_seconds": 2}],
+            "columns": [null, {"label": "path"}, {"label": "new", "title": "`new`"}]},
+        "rows": [["a", [9, 9], ""], {"cells": ["b", [9, 9], ""], "commit": "older"}]}"""
+    number = results.Number
+    return json.loads(text, parse_float=number, parse_int=number)
+
+
+def group(scene, label, error, denoised=True, seconds=2.0):
+    return {"scene": scene, "label": label, "mode": "one-shot", "budget_seconds": seconds, "denoised": denoised,
+            "relmse_trimmed": error, "flip": 0.1}  # fmt: skip
+
+
+GROUPS = [group("a", "path", 0.12345), group("a", "new", 2e-5), group("b", "path", 1.0), group("b", "new", None)]
+ENVIRONMENT = {"mitsuba": "3.9.1", "cores": 2, "cpu": "EPYC"}
+
+
+def test_numbers_of_a_comparison_fill_the_table(results, table):
+    others = [group("a", "path", 7.0, denoised=False), group("a", "path", 8.0, seconds=10.0)]
+    results.fill(table, {"groups": [*others, *GROUPS], "environment": ENVIRONMENT}, "abc1234", None)
+    assert table["rows"] == [["a", ["0.123", "0.100"], ["2e-05", "0.100"]], ["b", ["1", "0.100"], ""]]
+    assert table["columns"] == ["scene", "`path`", "`new`"]
+    assert (table["commit"], table["mitsuba"], table["machine"]) == ("abc1234", "3.9.1", "2 cores (EPYC)")
+    assert table["date"] > "2026-01-01"
+
+
+def test_numbers_have_the_digits_that_were_asked_for(results):
+    asked = ((0.08999, ".3f", "0.090"), (1234.0, "3g", "1230"), (2e-5, "2g", "2e-05"), (4.5, "2g", "4.5"))
+    assert [results._digits(value, digits) for value, digits, _ in asked] == [text for _, _, text in asked]
+
+
+def test_a_missing_integrator_is_named(results, table):
+    with pytest.raises(results.ResultsError, match="0 groups of the comparison have scene a, label new"):
+        results.fill(table, {"groups": [GROUPS[0], GROUPS[2]], "environment": ENVIRONMENT}, "abc1234", None)
+
+
+def test_what_cannot_be_run_says_why(results, table, monkeypatch):
+    monkeypatch.delenv("SCENES", raising=False)
+    assert results.not_run(table) == ""
+    assert "set SCENES" in results.not_run({**table, "command": "mi-neural compare $SCENES/a"})
+    assert "not kept" in results.not_run({**table, "command": None})
+    assert "by hand" in results.not_run({k: v for k, v in table.items() if k != "extract"})
+
+
+def test_extraction_of_every_table_fits_its_rows_and_columns(results):
+    found = [results.tables.read(file.stem) for file in results.tables.RESULTS.glob("*.json")]
+    found = [table for table in found if "extract" in table]
+    assert len(found) >= 5
+    for table in found:
+        assert len(table["extract"]["rows"]) == len(table["rows"])
+        assert len(table["extract"]["columns"]) == len(table["columns"])
+        keys = ("scene", "label", "mode", "budget_seconds", "denoised", "values", "title")
+        for part in (*table["extract"]["rows"], *table["extract"]["columns"]):
+            assert not set(part or {}) - set(keys)
+
+
+def test_a_command_runs_once_and_is_read(results, table, tmp_path, monkeypatch):
+    """The command here writes a report of its own; it fails the second time."""
+    code = "import json, pathlib, sys; f = pathlib.Path(sys.argv[1]) / 'results.json'; f.open('x').write('{\"a\": 1}')"
+    (tmp_path / "write.py").write_text(code, encoding="utf-8")
+    monkeypatch.setattr(results, "OUT", tmp_path / "out")
+    monkeypatch.setattr(results, "version", lambda paths: "abc1234")
+    asked = {**table, "command": f"{sys.executable} {tmp_path / 'write.py'} $OUT"}
+    assert results.run(asked) == {"a": 1} == results.run(asked)
+    next((tmp_path / "out").glob("*/done")).unlink()
+    with pytest.raises(results.ResultsError, match="status 1; type the same again"):
+        results.run(asked)
