@@ -182,7 +182,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         with LOCK:
             if not self.film_state.entered:
                 with dr.suspend_grad():
-                    self.bind(scene, RaySensor(ray))
+                    self.bind(scene, RaySensor(ray, medium=medium))
                 self.rendered(sampler.sample_count())
             settings = [dr.opaque(mi.Float, v) for v in self.settings(self.planned_spp or sampler.sample_count())]
             lane = mi.UInt32(sampler.next_1d() * 2**24)

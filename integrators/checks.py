@@ -8,30 +8,48 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural.render.media import has_instances, media_of
+
 #: Most entries of an array: Dr.Jit counts them in 32 bits.
 MOST_ENTRIES = 2**32 - 1
 #: Numbers of a pixel while an image is made: colour, alpha, weight, and copies of them.
 FILM_VALUES = 16
 
 
-def check_scene(scene, plugin: str) -> None:
-    """Refuse, before any work, a scene that cannot be rendered; the message says what to do."""
+def check_scene(scene, plugin: str, media: bool = False) -> None:
+    """Refuse, before any work, a scene that cannot be rendered; the message says what to do. `media`: whether the
+    plugin renders participating media."""
     if not scene.emitters():
         raise ValueError(f"{plugin}: the scene has no emitter, the image would be black; add a light")
-    for sensor in scene.sensors():
-        if sensor.get_medium() is not None:
-            raise ValueError(
-                f"{plugin}: the camera is inside a participating medium, and media are not modelled; "
-                'use <integrator type="volpath"/>'
-            )
-    for shape in scene.shapes():
-        if shape.is_medium_transition():
-            raise ValueError(
-                f"{plugin}: shape '{shape.id()}' borders a participating medium, and media are not modelled; "
-                'use <integrator type="volpath"/>'
-            )
+    if not media:
+        _refuse_media(scene, plugin)
     for emitter in scene.emitters():
         _check_emitter(emitter, plugin)
+
+
+def _refuse_media(scene, plugin: str) -> None:
+    works = (
+        'media are not modelled by it; use <integrator type="plain_path"/>, with a light sampler or without, or '
+        '<integrator type="volpath"/>'
+    )
+    for sensor in scene.sensors():
+        if sensor.get_medium() is not None:
+            raise ValueError(f"{plugin}: the camera is inside a participating medium, and {works}")
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            raise ValueError(f"{plugin}: shape '{shape.id()}' borders a participating medium, and {works}")
+    if has_instances(scene) and media_of(scene):
+        raise ValueError(f"{plugin}: an instance borders a participating medium, and {works}")
+
+
+def check_media(scene, sensor, plugin: str) -> None:
+    """Refuse media whose phase functions cannot be rendered here."""
+    for medium in media_of(scene, [sensor]):
+        if int(medium.phase_function().flags()) & int(mi.PhaseFunctionFlags.Microflake):
+            raise ValueError(
+                f"{plugin}: the medium '{medium.id()}' has a phase function of microflakes (sggx), which is not "
+                'modelled; use <integrator type="volpath"/>'
+            )
 
 
 def _check_emitter(emitter, plugin: str) -> None:

@@ -32,6 +32,8 @@ class LightSamplingIntegrator(FilmIntegrator):
 
     #: Whether images may be rendered with gradients.
     differentiable = True
+    #: Whether participating media are rendered.
+    renders_media = False
     PASS_SAMPLES, PIXEL_BYTES = 2**22, 64
 
     def __init__(self, props):
@@ -47,7 +49,7 @@ class LightSamplingIntegrator(FilmIntegrator):
     def bind(self, scene, sensor, train: bool = True) -> None:
         """Have lights chosen as they are in `scene` now; one frame of training. Refuses what cannot be rendered."""
         if not self.bound.knows(scene):
-            check_scene(scene, self.plugin)
+            check_scene(scene, self.plugin, self.renders_media)
             self.film_state.forget_scene()
             self.light_sampler = self.nested_sampler or exact_sampler(scene)
             self.lights = None
