@@ -103,10 +103,12 @@ class PlainPathIntegrator(LightSamplingIntegrator):
     def bind_media(self, scene, sensor, known: bool) -> None:
         """Look for media in a scene, and where the camera is in one."""
         medium = sensor.get_medium() if hasattr(sensor, "get_medium") else None
-        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.known)):
+        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
             self.film_state.forget_scene()
             self.media = Media.of(scene, [sensor])
             check_media(scene, sensor, self.plugin)
+        elif self.media is not None and self.media.edited():
+            self.film_state.forget_scene()
         if self.media is None:
             return
         if self.neural_depth >= 0:

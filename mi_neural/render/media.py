@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from .. import parameters
 from . import path as paths
 from . import vertex
 
@@ -154,17 +155,20 @@ class Place:
 
 
 class Media:
-    """How paths go through the media of a scene. Its attributes are plain facts of the scene.
+    """How paths go through the media of a scene. Its attributes are facts of the scene, which are compiled.
 
-    known           addresses of the media
+    media           the media, by their address
     heterogeneous   whether the density of a medium varies
     boundaries      whether there are surfaces that let all light pass
     partial         whether there are surfaces that let a part of the light pass, or shine and let it pass
     """
 
-    def __init__(self, known: set, heterogeneous: bool, boundaries: bool, partial: bool):
-        self.known = known
+    def __init__(self, media: dict, heterogeneous: bool, boundaries: bool, partial: bool):
+        self.media = media
         self.heterogeneous, self.boundaries, self.partial = heterogeneous, boundaries, partial
+        pairs = [(params, key) for params in map(parameters.traverse, media.values()) for key in params.keys()]
+        self.edits = parameters.Edits([(params, key) for params, key in pairs if _is_hidden(params, key)])
+        self.edits.changed()
 
     @classmethod
     def of(cls, scene, sensors=()) -> Media | None:
@@ -176,7 +180,11 @@ class Media:
         null = int(mi.BSDFFlags.Null)
         boundaries = unknown or any(lobes == null and not shines for lobes, shines in found)
         partial = unknown or any(lobes & null and (lobes != null or shines) for lobes, shines in found)
-        return cls({m.ptr for m in media}, not all(m.is_homogeneous() for m in media), boundaries, partial)
+        return cls({m.ptr: m for m in media}, not all(m.is_homogeneous() for m in media), boundaries, partial)
+
+    def edited(self) -> bool:
+        """Whether a parameter has changed, since the call before, that recorded functions take for a constant."""
+        return self.edits.changed()
 
     # -------------------------------------------------------------------------------------------------------------
     # The steps of a path
@@ -467,6 +475,11 @@ def media_of(scene, sensors=()) -> list:
         if medium is not None:
             found[medium.ptr] = medium
     return list(found.values())
+
+
+def _is_hidden(params, key: str) -> bool:
+    """Whether Dr.Jit does not see a parameter of a medium in Mitsuba 3.9.1: plain numbers, and phase functions."""
+    return "phase_function" in key or not dr.is_jit_v(parameters.read(params, key))
 
 
 def has_instances(scene) -> bool:
