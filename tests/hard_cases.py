@@ -20,6 +20,7 @@ class Case:
     build     gives the scene
     known     gives the scene that the right image is that of, where `build`'s holds values that are not finite
     refusal   the error must contain this, whatever the integrator; None: an image is expected
+    media     whether there are participating media: integrators that render these do not refuse it
     spp       samples a pixel of one of the images that are averaged
     sensors   how many of the scene's sensors are rendered
     """
@@ -29,6 +30,7 @@ class Case:
     refusal: str | None = None
     spp: int = 32
     sensors: int = 1
+    media: bool = False
 
 
 @dataclass
@@ -311,7 +313,7 @@ CASES: dict[str, Case] = {
     "all delta": Case(with_extra(all_delta), spp=64),
     "flipped normals": Case(with_extra(flipped_normals)),
     "alpha mask": Case(with_extra(alpha_mask)),
-    "participating medium": Case(with_extra(medium), refusal="participating medium"),
+    "participating medium": Case(with_extra(medium), refusal="participating medium", media=True),
     # ---- NaN and infinity
     "NaN in a texture": Case(room(texels=texel(np.nan)), known=room(texels=texel(0.0))),
     "infinity in a texture": Case(room(texels=texel(np.inf)), known=room(texels=texel(0.0))),
