@@ -7,7 +7,7 @@ import weakref
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.checks import check_film, sensor_of
+from mi_neural.integrators.checks import check_film, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
@@ -28,6 +28,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
     PASS_SAMPLES = PASS_SAMPLES
     #: Whether passes may be recorded.
     records = True
+    #: Whether participating media are rendered.
+    renders_media = False
     #: Bytes that are held at once of each pixel at one sample a pixel.
     PIXEL_BYTES = 64
 
@@ -129,6 +131,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
     def _checked(self, scene, sensor, spp: int):
         """The sensor of an image that can be rendered; ValueError for one that cannot."""
         sensor = self._sensor(scene, sensor)
+        if not self.renders_media:
+            refuse_medium_of(sensor, self.plugin)
         self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
         check_film(sensor, self.plugin, self.PIXEL_BYTES)
         return sensor

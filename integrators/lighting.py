@@ -32,8 +32,6 @@ class LightSamplingIntegrator(FilmIntegrator):
 
     #: Whether images may be rendered with gradients.
     differentiable = True
-    #: Whether participating media are rendered.
-    renders_media = False
     PASS_SAMPLES, PIXEL_BYTES = 2**22, 64
 
     def __init__(self, props):
@@ -66,6 +64,7 @@ class LightSamplingIntegrator(FilmIntegrator):
         sensor = self._checked(scene, sensor, spp)
         with LOCK:
             self.bind(scene, sensor)
+            self.check_gradients(scene)
             self.film_state.entered = True
             try:
                 image = mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
@@ -74,6 +73,9 @@ class LightSamplingIntegrator(FilmIntegrator):
             if self.should_stop():  # Ctrl-C, which Mitsuba takes in its own render() and may keep to itself
                 raise KeyboardInterrupt
             return image
+
+    def check_gradients(self, scene) -> None:
+        """Refuse what cannot be rendered with gradients in the scene that is bound."""
 
     def reset(self) -> None:
         """Forget what was learned. Compiled kernels are kept."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.checks import check_media
+from mi_neural.integrators.checks import check_gradients_in_media, check_lights_in_media, check_phase_functions
 from mi_neural.integrators.keys import LIGHT_SAMPLER_KEY, register
 from mi_neural.integrators.lighting import LightSamplingIntegrator
 from mi_neural.lights.unshadowed import UnshadowedLights
@@ -106,14 +106,20 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
             self.film_state.forget_scene()
             self.media = Media.of(scene, [sensor])
-            check_media(scene, sensor, self.plugin)
+            check_phase_functions(scene, sensor, self.plugin)
         elif self.media is not None and self.media.edited():
             self.film_state.forget_scene()
         if self.media is None:
             return
         if self.neural_depth >= 0:
             raise ValueError("plain_path: neural_depth works in scenes without participating media; leave it out")
+        if self.lights is not None:
+            check_lights_in_media(self.lights, self.plugin)
         self.camera_medium, self.camera_medium_id = medium, -1 if medium is None else medium.ptr
+
+    def check_gradients(self, scene) -> None:
+        if self.media is not None:
+            check_gradients_in_media(scene, self.plugin)
 
     def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
         """As `paths.direct_light`; from `neural_depth` on as it is predicted, and what mirrors show."""

@@ -11,7 +11,7 @@ from mi_neural.estimators import reservoir
 from mi_neural.estimators.mis import mis_weight
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators.base import refuse_gradients
-from mi_neural.integrators.checks import check_film, check_scene, sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights.sampling import PowerLights
@@ -206,6 +206,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The mean of the next `spp` frames (0: as many as the sampler's sample count says)."""
         sensor = sensor_of(scene, sensor, "restir_di")
+        refuse_medium_of(sensor, "restir_di")
         self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
         check_film(sensor, "restir_di", PIXEL_BYTES)
         spp = spp or sensor.sampler().sample_count()
