@@ -50,8 +50,14 @@ class PlainPathIntegrator(LightSamplingIntegrator):
          know lights one by one: no shadow ray, no noise, but a bias, as in ``nvc_direct`` with ``mode=neural``. -1:
          nowhere. (Default: -1)
 
-    *Works with* all surfaces and emitters of Mitsuba, in RGB, mono and spectral variants. *Leaves out* participating
-    media (use ``volpath``), polarization.
+    In participating media vertices are points where a medium scatters, too: the phase function stands in the place of
+    the BSDF. Distances are sampled by delta tracking; with extinctions that differ between colours, all of them are
+    weighted against each other (Miller et al. 2019). Transmittance along shadow rays is exact in homogeneous media, and
+    estimated by ratio tracking in others (Novák et al. 2014). ``rr_depth`` counts as in ``volpath`` there.
+
+    *Works with* all surfaces, emitters and media of Mitsuba, in RGB, mono and spectral variants. *Leaves out*
+    polarization, phase functions of microflakes (``sggx``: use ``volpath``), and in media gradients (use
+    ``prbvolpath``) and ``neural_depth``.
 
     .. tabs::
         .. code-tab:: xml

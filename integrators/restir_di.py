@@ -136,8 +136,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     *Works with* all surfaces and emitters of Mitsuba, any reconstruction filter, RGB variants ``llvm_ad_rgb`` and
     ``cuda_ad_rgb``. Motion is followed for pinhole cameras (``perspective``); other sensors look at the same pixel of
     the frame before. *Leaves out* reflected light (use ``nirc``), mirrors and glass beyond the emission that they show
-    directly, media (use ``volpath``), nesting in ``aov`` or ``moment``, and films that do not fit memory at one sample
-    a pixel (some 570 bytes each).
+    directly, media (use ``plain_path``), nesting in ``aov`` or ``moment``, and films that do not fit memory at one
+    sample a pixel (some 570 bytes each).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media.
 

@@ -253,6 +253,16 @@ def medium(_: Room) -> dict:
                       "interior": fog}}  # fmt: skip
 
 
+def media(density: float, albedo: float) -> Callable[[Room], dict]:
+    """Fog in a block, of an optical thickness of `density` over the room's side of 2."""
+
+    def block(_: Room) -> dict:
+        return {"block": medium(_)["block"] | {"interior": {"type": "homogeneous", "albedo": albedo,
+                                                            "sigma_t": density / 2}}}  # fmt: skip
+
+    return block
+
+
 def sensors(r: Room, views: int = 3) -> dict:
     """Further sensors: from the side, from within the room, one that looks away."""
     looks = [((1.5, 0.5, 3.0), (0, 0, 0)), ((0, 0, 0.8), (0.3, -0.5, -1)), ((0, 0.3, 0.9), (0, 0.2, -1))]
@@ -314,6 +324,9 @@ CASES: dict[str, Case] = {
     "flipped normals": Case(with_extra(flipped_normals)),
     "alpha mask": Case(with_extra(alpha_mask)),
     "participating medium": Case(with_extra(medium), refusal="participating medium", media=True),
+    "thin medium": Case(with_extra(media(1e-4, 0.8)), refusal="participating medium", media=True),
+    "thick medium": Case(with_extra(media(1e4, 0.8)), refusal="participating medium", media=True),
+    "medium of albedo 1": Case(with_extra(media(4.0, 1.0)), refusal="participating medium", media=True),
     # ---- NaN and infinity
     "NaN in a texture": Case(room(texels=texel(np.nan)), known=room(texels=texel(0.0))),
     "infinity in a texture": Case(room(texels=texel(np.inf)), known=room(texels=texel(0.0))),

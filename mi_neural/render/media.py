@@ -25,9 +25,7 @@ import mitsuba as mi
 from .. import parameters
 from . import path as paths
 from . import vertex
-
-#: Optical depths are compared up to this distance, so that none of them is infinite.
-FAR = 1e18
+from .tracking import colour, event, exists, flown, medium_interaction
 
 
 @dataclass
@@ -387,7 +385,7 @@ class Media:
             mei = medium.sample_interaction(ray, sampler.next_1d(), channel, tracking)
             collides = tracking & mei.is_valid() & (mei.t < left)
             majorant, m = mei.combined_extinction, colour(mei.combined_extinction, channel)
-            share = share * dr.select(tracking, dr.exp(-_flown(mei, left) * (majorant - m)), 1)
+            share = share * dr.select(tracking, dr.exp(-flown(mei, left) * (majorant - m)), 1)
             share *= dr.select(collides, mei.sigma_n * dr.rcp(m), 1)
             ray.o = dr.select(collides, mei.p, ray.o)
             left -= dr.select(collides, mei.t, 0)
@@ -395,53 +393,6 @@ class Media:
 
         state = (inside & ~exact, mi.Ray3f(ray), mi.Float(length), share, sampler)
         return dr.while_loop(state, lambda tracking, *_: tracking, step, label="ratio tracking")[3:]
-
-
-def event(mei, distance, u, channel, shares, active) -> tuple:
-    """What happens at a sampled distance, before a surface at `distance`: (whether the medium scatters, whether it is a
-    null collision, weight, shares). `u` decides between the two.
-
-    All colours could have sampled what happened: its density is the mean of theirs, each with its share of the path so
-    far (spectral MIS; Miller et al. 2019). `shares` are brought up to date.
-    """
-    collides = active & mei.is_valid() & (mei.t < distance)
-    majorant = mei.combined_extinction
-    real = collides & (u * colour(majorant, channel) < colour(mei.sigma_t, channel))
-    null = collides & ~real
-    # What all colours have in common of the transmittance is left out, as it cancels
-    flown = dr.exp(-_flown(mei, distance) * (majorant - dr.min(majorant)))
-    density = flown * dr.select(real, mei.sigma_t, dr.select(null, mei.sigma_n, 1))
-    value = flown * dr.select(real, mei.sigma_s, dr.select(null, mei.sigma_n, 1))
-    density *= shares
-    total = dr.sum(density)
-    possible = active & (total > 0)
-    inv = dr.select(possible, dr.rcp(total), 0)
-    return real, null, dr.select(active, value * inv, 1), dr.select(possible, density * inv, shares)
-
-
-def _flown(mei, distance):
-    """Way through the medium up to a sampled distance, or up to a surface at `distance`."""
-    return dr.clip(dr.minimum(mei.t, distance) - mei.mint, 0, FAR)
-
-
-def colour(value, channel):
-    """The value of one colour, by which distances are sampled: in RGB variants `channel`, in others the first."""
-    if not mi.is_rgb:
-        return value[0]
-    return dr.select(channel == 0, value[0], dr.select(channel == 1, value[1], value[2]))
-
-
-def exists(pointer):
-    """Whether a pointer points to something."""
-    return dr.reinterpret_array(mi.UInt32, pointer) > 0
-
-
-def medium_interaction(p, ray, medium):
-    """A point in a medium, as its phase function takes it: light goes on against `ray`."""
-    mei = dr.zeros(mi.MediumInteraction3f)
-    mei.p, mei.wi, mei.sh_frame, mei.medium = p, -ray.d, mi.Frame3f(-ray.d), medium
-    mei.time, mei.wavelengths = ray.time, ray.wavelengths
-    return mei
 
 
 def scattering_point(path: MediumPath):
