@@ -68,8 +68,8 @@ def check_lights_in_media(lights, plugin: str) -> None:
         arguments = inspect.signature(getattr(lights, name)).parameters.values()
         if not any(a.name == "around" or a.kind == a.VAR_KEYWORD for a in arguments):
             raise ValueError(
-                f"{plugin}: the light sampler's {type(lights).__name__}.{name} has no argument 'around', which names the "
-                "points in a participating medium; add around=None to it (mi-neural doc extend)"
+                f"{plugin}: the light sampler's {type(lights).__name__}.{name} has no argument 'around', which names "
+                "the points in a participating medium; add around=None to it (mi-neural doc extend)"
             )
 
 
