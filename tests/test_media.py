@@ -133,6 +133,16 @@ def test_wrappers_know_the_medium_of_the_camera(wrapper):
     assert_same_mean(ours, known, wrapper["type"], blocks=2, relative=1e-4, tests=N_TESTS)
 
 
+def test_lamps_outside_of_fog_are_visible_from_within():
+    """Boundaries of media are no walls to what `nvc_lights` learns."""
+    scene = room(box=cube(fog(0.5)))
+    integrator = mi.load_dict({"type": "plain_path", "light_sampler": {"type": "nvc_lights"}})
+    mi.render(scene, integrator=integrator, spp=1)
+    visible = [float(v[0]) for v in integrator.light_sampler.cache.field.query(mi.Point3f(-0.2, 0.1, 0.1))]
+    print(visible)
+    assert max(visible) > 0.8
+
+
 # ---------------------------------------------------------------- changes from frame to frame
 
 CHANGES = {

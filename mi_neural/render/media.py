@@ -25,7 +25,7 @@ import mitsuba as mi
 from .. import parameters
 from . import path as paths
 from . import vertex
-from .tracking import colour, event, exists, flown, medium_interaction
+from .tracking import colour, event, exists, flown, is_boundary, medium_interaction
 
 
 @dataclass
@@ -322,7 +322,7 @@ class Media:
         """Whether a surface lets all light pass."""
         if not self.boundaries:
             return mi.Bool(False)
-        passes = (si.bsdf().flags() & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
+        passes = is_boundary(si.bsdf())
         return passes & ~exists(si.shape.emitter()) if self.partial else passes
 
     def _track(self, f: Flight, distance, channel, sampler, inside) -> tuple:

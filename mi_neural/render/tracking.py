@@ -43,6 +43,27 @@ def colour(value, channel):
     return dr.select(channel == 0, value[0], dr.select(channel == 1, value[1], value[2]))
 
 
+def is_boundary(bsdf):
+    """Whether a surface lets all light pass unchanged in direction: the boundary of a medium, say."""
+    return (bsdf.flags() & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
+
+
+def shadowed(scene, ray, active):
+    """Whether a surface that is no :func:`is_boundary` lies on a ray, up to its end."""
+
+    def step(active, ray, shadow):
+        si = scene.ray_intersect(ray, active)
+        meets = active & si.is_valid()
+        passes = meets & is_boundary(si.bsdf())
+        left = ray.maxt - si.t
+        ray = dr.select(passes, si.spawn_ray(ray.d), ray)
+        ray.maxt = dr.select(passes, left, ray.maxt)
+        return passes & (left > 0), ray, shadow | (meets & ~passes)
+
+    state = (mi.Bool(active), mi.Ray3f(ray), mi.Bool(False))
+    return dr.while_loop(state, lambda active, *_: active, step, label="shadows")[2]
+
+
 def exists(pointer):
     """Whether a pointer points to something."""
     return dr.reinterpret_array(mi.UInt32, pointer) > 0
