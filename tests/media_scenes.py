@@ -66,6 +66,14 @@ def room(camera: dict | None = None, size=8, **parts) -> mi.Scene:
     return mi.load_dict(scene)
 
 
+def clouds(medium: dict) -> mi.Scene:
+    """The room with two instances of a cube of `medium`."""
+    of = {"type": "instance", "shapegroup": {"type": "ref", "id": "cloud"}}
+    places = [T().translate([x, y, 0]).scale(0.6) for x, y in ((-0.5, 0), (0.5, -0.3))]
+    return room(cloud={"type": "shapegroup", "part": cube(medium)},
+                **{f"cloud{k}": of | {"to_world": place} for k, place in enumerate(places)})  # fmt: skip
+
+
 def everywhere(medium: dict, **parts) -> mi.Scene:
     """The room inside of a medium that fills it; the camera is in it, too."""
     medium = medium | {"id": "air"}

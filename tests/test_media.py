@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from expectation import assert_same_mean, renders
-from media_scenes import ball, cube, everywhere, fog, lamp, rgb, room, smoke
+from media_scenes import ball, clouds, cube, everywhere, fog, lamp, rgb, room, smoke
 
 from mi_neural.emitters.common import LightSampler
 from mi_neural.estimators.mis import mis_weight
@@ -40,6 +40,7 @@ SCENES = {
     "camera in colours": (lambda: everywhere(fog((0.1, 0.3, 0.6), 0.8, g=0.3)), "volpathmis"),
     "nested": (lambda: everywhere(fog(0.3), inner=ball(fog(3.0, 0.9), exterior={"type": "ref", "id": "air"})),
                "volpath"),
+    "instances": (lambda: clouds(fog(3.0, 0.9)), "volpath"),
     "albedo 1": (lambda: room(box=cube(fog(3.0, 1.0))), "volpath"),
     "albedo 0": (lambda: room(box=cube(fog(2.0, 0.0))), "volpath"),
     "thin": (lambda: room(box=cube(fog(1e-4 / SIZE, 0.8))), "volpath"),
@@ -64,7 +65,8 @@ SAMPLERS = {
 }  # fmt: skip
 CHOSEN = [("homogeneous", "uniform"), ("homogeneous", "power"), ("camera inside", "uniform"), ("camera inside", "nvc"),
           ("colours", "nvc"), ("things in it", "clusters"), ("sky", "cells"), ("heterogeneous", "nvc"),
-          ("half open shell", "nvc"), ("half open shell", "power"), ("points", "unlearned")]  # fmt: skip
+          ("instances", "nvc"), ("half open shell", "nvc"),
+          ("half open shell", "power"), ("points", "unlearned")]  # fmt: skip
 #: Comparisons of this file with a reference; together they fail by chance one choice of seeds in ten thousand.
 VARIANTS = ("llvm_ad_mono", "llvm_ad_spectral")
 IN_VARIANTS = [("colours", "nvc"), ("coloured smoke", None), ("camera in colours", "uniform")]
@@ -209,6 +211,11 @@ def test_integrators_without_media_name_the_one_that_renders_them(name, where):
     with pytest.raises(ValueError, match=name + r': .*participating medium.*use <integrator type="plain_path"/>') as e:
         mi.load_dict({"type": name}).render(scene, sensor, spp=1)
     assert "\n" not in str(e.value)
+
+
+def test_medium_of_an_instance_is_refused_by_integrators_without_media():
+    with pytest.raises(ValueError, match=r'instance borders a participating medium.*use <integrator type="plain_path"'):
+        mi.load_dict({"type": "nirc"}).render(clouds(fog()), spp=1)
 
 
 def gradient(scene, key: str, how: str) -> None:
