@@ -67,11 +67,11 @@ CHOSEN = [("homogeneous", "uniform"), ("homogeneous", "power"), ("camera inside"
           ("colours", "nvc"), ("things in it", "clusters"), ("sky", "cells"), ("heterogeneous", "nvc"),
           ("instances", "nvc"), ("half open shell", "nvc"),
           ("half open shell", "power"), ("points", "unlearned")]  # fmt: skip
-#: Comparisons of this file with a reference; together they fail by chance one choice of seeds in ten thousand.
 VARIANTS = ("llvm_ad_mono", "llvm_ad_spectral")
 IN_VARIANTS = [("colours", "nvc"), ("coloured smoke", None), ("camera in colours", "uniform")]
 LIMITS = [{"max_depth": 1}, {"max_depth": 2}, {"max_depth": 3, "rr_depth": 1}, {"max_depth": -1, "rr_depth": 2},
           {"max_depth": 4, "hide_emitters": True}]  # fmt: skip
+#: Comparisons of this file with a reference; together they fail by chance one choice of seeds in ten thousand.
 N_TESTS = len(SCENES) + len(CHOSEN) + len(VARIANTS) * len(IN_VARIANTS) + 2 * len(LIMITS) + 8
 DEPTH = {"max_depth": 8}
 
