@@ -67,9 +67,11 @@ class NVCLightSampler(LightSampler):
          faults. (Default: scene)
 
     *Works with* all emitters of Mitsuba; point, spot and directional lights, meshes of thousands of emissive triangles
-    and the environment can be mixed. With a single light it costs nothing. *Leaves out* glossy lobes: surfaces weigh
-    lights by irradiance (with the lobes by linearly transformed cosines a choice takes 2 to 2.6 times as long; variance
-    0.98 of this on a staircase, 0.67 between glossy lamps).
+    and the environment can be mixed. With a single light it costs nothing. Points in a participating
+    medium count light from all directions alike, and boundaries of media are no walls. *Leaves out* what media absorb
+    on the way, phase functions, and glossy lobes: surfaces weigh lights by irradiance (with the lobes by linearly
+    transformed cosines a choice takes 2 to 2.6 times as long; variance 0.98 of this on a staircase, 0.67 between
+    glossy lamps).
 
     .. tabs::
         .. code-tab:: xml

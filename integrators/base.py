@@ -7,7 +7,7 @@ import weakref
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.checks import check_film, sensor_of
+from mi_neural.integrators.checks import check_film, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
@@ -28,6 +28,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
     PASS_SAMPLES = PASS_SAMPLES
     #: Whether passes may be recorded.
     records = True
+    #: Whether participating media are rendered.
+    renders_media = False
     #: Bytes that are held at once of each pixel at one sample a pixel.
     PIXEL_BYTES = 64
 
@@ -129,6 +131,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
     def _checked(self, scene, sensor, spp: int):
         """The sensor of an image that can be rendered; ValueError for one that cannot."""
         sensor = self._sensor(scene, sensor)
+        if not self.renders_media:
+            refuse_medium_of(sensor, self.plugin)
         self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
         check_film(sensor, self.plugin, self.PIXEL_BYTES)
         return sensor
@@ -182,7 +186,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         with LOCK:
             if not self.film_state.entered:
                 with dr.suspend_grad():
-                    self.bind(scene, RaySensor(ray))
+                    self.bind(scene, RaySensor(ray, medium=medium))
                 self.rendered(sampler.sample_count())
             settings = [dr.opaque(mi.Float, v) for v in self.settings(self.planned_spp or sampler.sample_count())]
             lane = mi.UInt32(sampler.next_1d() * 2**24)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mi_neural import parameters
+from mi_neural.render.media import has_instances, media_of
 
 #: Most entries of an array: Dr.Jit counts them in 32 bits.
 MOST_ENTRIES = 2**32 - 1
@@ -14,24 +18,69 @@ MOST_ENTRIES = 2**32 - 1
 FILM_VALUES = 16
 
 
-def check_scene(scene, plugin: str) -> None:
-    """Refuse, before any work, a scene that cannot be rendered; the message says what to do."""
+#: What renders participating media.
+WITH_MEDIA = (
+    'media are not modelled by it; use <integrator type="plain_path"/>, with a light sampler or without, or '
+    '<integrator type="volpath"/>'
+)
+
+
+def check_scene(scene, plugin: str, media: bool = False) -> None:
+    """Refuse, before any work, a scene that cannot be rendered; the message says what to do. `media`: whether the
+    plugin renders participating media."""
     if not scene.emitters():
         raise ValueError(f"{plugin}: the scene has no emitter, the image would be black; add a light")
-    for sensor in scene.sensors():
-        if sensor.get_medium() is not None:
-            raise ValueError(
-                f"{plugin}: the camera is inside a participating medium, and media are not modelled; "
-                'use <integrator type="volpath"/>'
-            )
-    for shape in scene.shapes():
-        if shape.is_medium_transition():
-            raise ValueError(
-                f"{plugin}: shape '{shape.id()}' borders a participating medium, and media are not modelled; "
-                'use <integrator type="volpath"/>'
-            )
+    if not media:
+        _refuse_media(scene, plugin)
     for emitter in scene.emitters():
         _check_emitter(emitter, plugin)
+
+
+def _refuse_media(scene, plugin: str) -> None:
+    for sensor in scene.sensors():
+        refuse_medium_of(sensor, plugin)
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            raise ValueError(f"{plugin}: shape '{shape.id()}' borders a participating medium, and {WITH_MEDIA}")
+    if has_instances(scene) and media_of(scene):
+        raise ValueError(f"{plugin}: an instance borders a participating medium, and {WITH_MEDIA}")
+
+
+def refuse_medium_of(sensor, plugin: str) -> None:
+    """Refuse a sensor that is inside a participating medium."""
+    if hasattr(sensor, "get_medium") and sensor.get_medium() is not None:
+        raise ValueError(f"{plugin}: the camera is inside a participating medium, and {WITH_MEDIA}")
+
+
+def check_phase_functions(scene, sensor, plugin: str) -> None:
+    """Refuse media whose phase functions cannot be rendered here."""
+    for medium in media_of(scene, [sensor]):
+        if int(medium.phase_function().flags()) & int(mi.PhaseFunctionFlags.Microflake):
+            raise ValueError(
+                f"{plugin}: the medium '{medium.id()}' has a phase function of microflakes (sggx), which is not "
+                'modelled; use <integrator type="volpath"/>'
+            )
+
+
+def check_lights_in_media(lights, plugin: str) -> None:
+    """Refuse an object that chooses lights for surfaces alone (see :mod:`mi_neural.lights.sampling`)."""
+    for name in ("choose", "pmf"):
+        arguments = inspect.signature(getattr(lights, name)).parameters.values()
+        if not any(a.name == "around" or a.kind == a.VAR_KEYWORD for a in arguments):
+            raise ValueError(
+                f"{plugin}: the light sampler's {type(lights).__name__}.{name} has no argument 'around', which names "
+                "the points in a participating medium; add around=None to it (mi-neural doc extend)"
+            )
+
+
+def check_gradients_in_media(scene, plugin: str) -> None:
+    """Refuse gradients in a scene with participating media, if derivatives with respect to it are wanted."""
+    params = mi.traverse(scene)
+    if any(dr.grad_enabled(value) for value in (parameters.read(params, key) for key in params.keys())):
+        raise RuntimeError(
+            f"{plugin}: there are no gradients in scenes with participating media; use Mitsuba's own, "
+            "mi.render(scene, params, integrator=mi.load_dict({'type': 'prbvolpath'}))"
+        )
 
 
 def _check_emitter(emitter, plugin: str) -> None:
@@ -40,11 +89,11 @@ def _check_emitter(emitter, plugin: str) -> None:
     parts = [(f"emitter '{emitter.id()}'", mi.traverse(emitter), "")]
     if shape is not None and shape.is_mesh():
         parts.append((f"the mesh '{shape.id()}', which shines,", mi.traverse(shape), "vertex_positions"))
-    for name, parameters, only in parts:
-        for key in parameters.keys():
+    for name, params, only in parts:
+        for key in params.keys():
             if only and key != only:
                 continue
-            value = parameters[key]
+            value = params[key]
             if dr.is_array_v(value) and dr.is_float_v(value) and not np.isfinite(np.array(value)).all():
                 raise ValueError(
                     f"{plugin}: {name} has values that are not finite in '{key}'; "

@@ -47,7 +47,7 @@ class LightSamplingIntegrator(FilmIntegrator):
     def bind(self, scene, sensor, train: bool = True) -> None:
         """Have lights chosen as they are in `scene` now; one frame of training. Refuses what cannot be rendered."""
         if not self.bound.knows(scene):
-            check_scene(scene, self.plugin)
+            check_scene(scene, self.plugin, self.renders_media)
             self.film_state.forget_scene()
             self.light_sampler = self.nested_sampler or exact_sampler(scene)
             self.lights = None
@@ -64,6 +64,7 @@ class LightSamplingIntegrator(FilmIntegrator):
         sensor = self._checked(scene, sensor, spp)
         with LOCK:
             self.bind(scene, sensor)
+            self.check_gradients(scene)
             self.film_state.entered = True
             try:
                 image = mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
@@ -72,6 +73,9 @@ class LightSamplingIntegrator(FilmIntegrator):
             if self.should_stop():  # Ctrl-C, which Mitsuba takes in its own render() and may keep to itself
                 raise KeyboardInterrupt
             return image
+
+    def check_gradients(self, scene) -> None:
+        """Refuse what cannot be rendered with gradients in the scene that is bound."""
 
     def reset(self) -> None:
         """Forget what was learned. Compiled kernels are kept."""

@@ -138,7 +138,7 @@ NeuralPathIntegrator.__doc__ = (
     the end of the path), ``density`` (training records per frame near the first vertex).
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``volpath``), polarization, spectral rendering, ``blend`` (use ``nrc``).
+    participating media (use ``plain_path``), polarization, spectral rendering, ``blend`` (use ``nrc``).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.

@@ -369,9 +369,9 @@ NIRCIntegrator.__doc__ = (
     direct light alone not counted.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside
-    the cache (use ``path``). Thin walls between very bright and dark places leak until some 300 frames were trained
-    (use ``spread``).
+    participating media (use ``plain_path``), polarization, spectral rendering, and a limit to the number of bounces
+    inside the cache (use ``path``). Thin walls between very bright and dark places leak until some 300 frames were
+    trained (use ``spread``).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.

@@ -460,7 +460,7 @@ NIRCTwoLevelIntegrator.__doc__ = (
     the variance of the pixel.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``volpath``), polarization, spectral rendering, ``blend`` (use ``nirc``).
+    participating media (use ``plain_path``), polarization, spectral rendering, ``blend`` (use ``nirc``).
     ``share_cache(other)`` goes on with the cache of a ``nirc``; cache files of either can be read by both.
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;

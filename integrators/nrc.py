@@ -122,8 +122,8 @@ NRCIntegrator.__doc__ = (
     loss of the latest training frame, ``cache.history`` holds those of all.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``volpath``), polarization, spectral rendering, and a limit to the number of bounces inside
-    the cache (use ``path``). Sharp reflections seen by way of a rough surface are blurred.
+    participating media (use ``plain_path``), polarization, spectral rendering, and a limit to the number of bounces
+    inside the cache (use ``path``). Sharp reflections seen by way of a rough surface are blurred.
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.

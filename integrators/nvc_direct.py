@@ -98,7 +98,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
          cluster. (Default: 0)
 
     *Works with* all surfaces and emitters of Mitsuba. *Leaves out* light reflected more than once (use ``nirc``),
-    participating media (use ``volpath``), and in ``neural``: textures on lights and the detail of the environment
+    participating media (use ``plain_path``), and in ``neural``: textures on lights and the detail of the environment
     (their mean counts), shadows within the environment. What a material's mirror lobe shows of lights (``plastic``) is
     traced in every mode.
 

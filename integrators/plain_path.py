@@ -5,11 +5,13 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural.integrators.checks import check_gradients_in_media, check_lights_in_media, check_phase_functions
 from mi_neural.integrators.keys import LIGHT_SAMPLER_KEY, register
 from mi_neural.integrators.lighting import LightSamplingIntegrator
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
+from mi_neural.render.media import Media
 from mi_neural.render.spectrum import is_rgb
 
 
@@ -48,8 +50,14 @@ class PlainPathIntegrator(LightSamplingIntegrator):
          know lights one by one: no shadow ray, no noise, but a bias, as in ``nvc_direct`` with ``mode=neural``. -1:
          nowhere. (Default: -1)
 
-    *Works with* all surfaces and emitters of Mitsuba, in RGB, mono and spectral variants. *Leaves out* participating
-    media (use ``volpath``), polarization.
+    In participating media vertices are points where a medium scatters, too: the phase function stands in the place of
+    the BSDF. Distances are sampled by delta tracking; with extinctions that differ between colours, all of them are
+    weighted against each other (Miller et al. 2019). Transmittance along shadow rays is exact in homogeneous media, and
+    estimated by ratio tracking in others (Novák et al. 2014). ``rr_depth`` counts as in ``volpath`` there.
+
+    *Works with* all surfaces, emitters and media of Mitsuba, in RGB, mono and spectral variants. *Leaves out*
+    polarization, phase functions of microflakes (``sggx``: use ``volpath``), and in media gradients (use
+    ``prbvolpath``) and ``neural_depth``.
 
     .. tabs::
         .. code-tab:: xml
@@ -62,8 +70,12 @@ class PlainPathIntegrator(LightSamplingIntegrator):
     """
     )
 
+    renders_media = True
+
     def __init__(self, props):
         super().__init__(props)
+        self.media: Media | None = None
+        self.camera_medium, self.camera_medium_id = None, -1
         self.neural_depth = props.get("neural_depth", -1)
         self.records = self.neural_depth < 0
         self.unshadowed: UnshadowedLights | None = None
@@ -75,7 +87,9 @@ class PlainPathIntegrator(LightSamplingIntegrator):
             raise ValueError("plain_path: neural_depth needs an nvc_lights with visibility=true as light_sampler")
 
     def bind(self, scene, sensor, train: bool = True) -> None:
+        known = self.bound.knows(scene)
         super().bind(scene, sensor, train)
+        self.bind_media(scene, sensor, known)
         if self.neural_depth < 0 or self.lights is None:  # a single light is traced as ever
             self.unshadowed = None
             return
@@ -92,6 +106,27 @@ class PlainPathIntegrator(LightSamplingIntegrator):
             else:
                 self.unshadowed.refresh()
 
+    def bind_media(self, scene, sensor, known: bool) -> None:
+        """Look for media in a scene, and where the camera is in one."""
+        medium = sensor.get_medium() if hasattr(sensor, "get_medium") else None
+        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
+            self.film_state.forget_scene()
+            self.media = Media.of(scene, [sensor])
+            check_phase_functions(scene, sensor, self.plugin)
+        elif self.media is not None and self.media.edited():
+            self.film_state.forget_scene()
+        if self.media is None:
+            return
+        if self.neural_depth >= 0:
+            raise ValueError("plain_path: neural_depth works in scenes without participating media; leave it out")
+        if self.lights is not None:
+            check_lights_in_media(self.lights, self.plugin)
+        self.camera_medium, self.camera_medium_id = medium, -1 if medium is None else medium.ptr
+
+    def check_gradients(self, scene) -> None:
+        if self.media is not None:
+            check_gradients_in_media(scene, self.plugin)
+
     def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
         """As `paths.direct_light`; from `neural_depth` on as it is predicted, and what mirrors show."""
         predicted = path.active & (path.depth > self.neural_depth)
@@ -104,6 +139,8 @@ class PlainPathIntegrator(LightSamplingIntegrator):
 
     def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] = Le + ∫ f L cos dω, at each vertex direct light plus the rest of the path."""
+        if self.media is not None:
+            return self.estimate_media(scene, lights, sampler, mi.Ray3f(dr.detach(ray)), active)
         limit = self.depth_limit
         direct = self.direct if self.unshadowed is not None else None
 
@@ -113,6 +150,19 @@ class PlainPathIntegrator(LightSamplingIntegrator):
             return paths.roulette(path, sampler, self.rr_depth)
 
         path = paths.camera_vertex(self, scene, mi.Ray3f(dr.detach(ray)), active)
+        path, sampler = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="path")
+        return path.L, path.valid, {}
+
+    def estimate_media(self, scene, lights, sampler, ray, active):
+        """As `estimate`, where there are media: vertices are surfaces, and points at which a medium scatters."""
+        media = self.media
+
+        def step(path, sampler):
+            found, sampler = media.bounce(self, scene, lights, path, sampler)
+            path = media.advance(self, path, found)
+            return paths.roulette(path, sampler, self.rr_depth + 1)  # volpath's begins one bounce later
+
+        path, sampler = media.camera_vertex(self, scene, ray, self.camera_medium, sampler, active)
         path, sampler = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="path")
         return path.L, path.valid, {}
 

@@ -11,7 +11,7 @@ from mi_neural.estimators import reservoir
 from mi_neural.estimators.mis import mis_weight
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators.base import refuse_gradients
-from mi_neural.integrators.checks import check_film, check_scene, sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.lights.sampling import PowerLights
@@ -136,8 +136,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     *Works with* all surfaces and emitters of Mitsuba, any reconstruction filter, RGB variants ``llvm_ad_rgb`` and
     ``cuda_ad_rgb``. Motion is followed for pinhole cameras (``perspective``); other sensors look at the same pixel of
     the frame before. *Leaves out* reflected light (use ``nirc``), mirrors and glass beyond the emission that they show
-    directly, media (use ``volpath``), nesting in ``aov`` or ``moment``, and films that do not fit memory at one sample
-    a pixel (some 570 bytes each).
+    directly, media (use ``plain_path``), nesting in ``aov`` or ``moment``, and films that do not fit memory at one
+    sample a pixel (some 570 bytes each).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media.
 
@@ -206,6 +206,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """The mean of the next `spp` frames (0: as many as the sampler's sample count says)."""
         sensor = sensor_of(scene, sensor, "restir_di")
+        refuse_medium_of(sensor, "restir_di")
         self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
         check_film(sensor, "restir_di", PIXEL_BYTES)
         spp = spp or sensor.sampler().sample_count()

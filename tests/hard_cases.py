@@ -20,6 +20,7 @@ class Case:
     build     gives the scene
     known     gives the scene that the right image is that of, where `build`'s holds values that are not finite
     refusal   the error must contain this, whatever the integrator; None: an image is expected
+    media     whether there are participating media: integrators that render these do not refuse it
     spp       samples a pixel of one of the images that are averaged
     sensors   how many of the scene's sensors are rendered
     """
@@ -29,6 +30,7 @@ class Case:
     refusal: str | None = None
     spp: int = 32
     sensors: int = 1
+    media: bool = False
 
 
 @dataclass
@@ -251,6 +253,16 @@ def medium(_: Room) -> dict:
                       "interior": fog}}  # fmt: skip
 
 
+def media(density: float, albedo: float) -> Callable[[Room], dict]:
+    """Fog in a block, of an optical thickness of `density` over the room's side of 2."""
+
+    def block(_: Room) -> dict:
+        return {"block": medium(_)["block"] | {"interior": {"type": "homogeneous", "albedo": albedo,
+                                                            "sigma_t": density / 2}}}  # fmt: skip
+
+    return block
+
+
 def sensors(r: Room, views: int = 3) -> dict:
     """Further sensors: from the side, from within the room, one that looks away."""
     looks = [((1.5, 0.5, 3.0), (0, 0, 0)), ((0, 0, 0.8), (0.3, -0.5, -1)), ((0, 0.3, 0.9), (0, 0.2, -1))]
@@ -311,7 +323,10 @@ CASES: dict[str, Case] = {
     "all delta": Case(with_extra(all_delta), spp=64),
     "flipped normals": Case(with_extra(flipped_normals)),
     "alpha mask": Case(with_extra(alpha_mask)),
-    "participating medium": Case(with_extra(medium), refusal="participating medium"),
+    "participating medium": Case(with_extra(medium), refusal="participating medium", media=True),
+    "thin medium": Case(with_extra(media(1e-4, 0.8)), refusal="participating medium", media=True),
+    "thick medium": Case(with_extra(media(1e4, 0.8)), refusal="participating medium", media=True),
+    "medium of albedo 1": Case(with_extra(media(4.0, 1.0)), refusal="participating medium", media=True),
     # ---- NaN and infinity
     "NaN in a texture": Case(room(texels=texel(np.nan)), known=room(texels=texel(0.0))),
     "infinity in a texture": Case(room(texels=texel(np.inf)), known=room(texels=texel(0.0))),

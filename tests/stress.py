@@ -40,6 +40,14 @@ class Entrant:
     biased: bool = False
     resets: bool = False
 
+    def refusal(self, case) -> str | None:
+        """What the error of a hard case must contain; None: an image is expected."""
+        return None if case.media and self.keys["type"] in ("plain_path", "volpath") else case.refusal
+
+    def reference(self, case) -> str:
+        """The name of what it is compared with."""
+        return "volpath" if case.media else "path, direct" if self.depth == 2 else "path"
+
 
 #: Lights that the camera sees are noise of a known kind: left out by all, what they light is measured the better.
 PATH = {"hide_emitters": True}
@@ -68,6 +76,7 @@ ENTRANTS: dict[str, Entrant] = {
 REFERENCES = {
     "path": Entrant({"type": "path", **PATH}),
     "path, direct": Entrant({"type": "path", "max_depth": 2, **PATH}, depth=2),
+    "volpath": Entrant({"type": "volpath", **PATH}),
 }
 
 
@@ -177,18 +186,18 @@ def run(name: str, cases: list[str], results: Path) -> None:
             raise SystemExit(f"{name}, {left[0] if left else 'at its end'}: exit status {process.returncode}")
 
 
-def table(found: dict, refusals: dict, cases: list[str], entrants: list[str]) -> tuple[list[str], list[str]]:
-    """(lines of the table in Markdown, lines that say what is not as it must be)."""
+def table(found: dict, of: dict, cases: list[str], entrants: list[str]) -> tuple[list[str], list[str]]:
+    """(lines of the table in Markdown, lines that say what is not as it must be). `of`: the cases by name."""
     lines, wrong = ["| | " + " | ".join(f"`{e}`" for e in entrants) + " |", "|---" * (len(entrants) + 1) + "|"], []
     for case in cases:
         row = []
         for name in entrants:
             entrant = ENTRANTS[name]
-            reference = found.get(("path" if entrant.depth != 2 else "path, direct", case))
+            reference = found.get((entrant.reference(of[case]), case))
             if (name, case) not in found:
                 row.append("")
                 continue
-            ok, text = judge(found[name, case], reference, entrant, refusals[case])
+            ok, text = judge(found[name, case], reference, entrant, entrant.refusal(of[case]))
             row.append(text)
             if not ok:
                 wrong.append(f"{case}, {name}: {text}")
@@ -217,7 +226,7 @@ def main() -> None:
 
     cases = arguments.case or list(hard_cases.CASES)
     entrants = arguments.integrator or list(ENTRANTS)
-    refusals = {name: hard_cases.CASES[name].refusal for name in cases}
+    of = {name: hard_cases.CASES[name] for name in cases}
     arguments.output.mkdir(parents=True, exist_ok=True)
     results = arguments.output / "results.jsonl"
     results.touch()
@@ -228,9 +237,13 @@ def main() -> None:
 
     for name in [*REFERENCES, *entrants]:
         known = done()
-        wanted = [c for c in cases if (name, c) not in known and not (name in REFERENCES and refusals[c])]
+        wanted = [c for c in cases if (name, c) not in known]
+        if name in REFERENCES:
+            media, depth = name == "volpath", REFERENCES[name].depth
+            wanted = [c for c in wanted if of[c].media == media and (depth != 2 or not media)]
+            wanted = [c for c in wanted if REFERENCES[name].refusal(of[c]) is None]
         run(name, wanted, results)
-    lines, wrong = table(done(), refusals, cases, entrants)
+    lines, wrong = table(done(), of, cases, entrants)
     (arguments.output / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print("\n".join(lines))
     print("\n".join(wrong) or "All cells are as they must be.")

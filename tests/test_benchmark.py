@@ -295,6 +295,16 @@ def test_depth_is_carried_where_it_is_known():
     assert keys == {"hide_emitters": True}
 
 
+def test_reference_of_a_scene_with_media_is_that_of_volpath(loaded, tmp_path):
+    from dataclasses import replace
+
+    from media_scenes import cube, fog, room
+
+    foggy = replace(loaded, scene=room(box=cube(fog())))
+    assert reference.reference_path(foggy, tmp_path) != reference.reference_path(loaded, tmp_path)
+    assert reference.render_reference(foggy, 1, tmp_path).metadata["integrator"] == "volpath"
+
+
 def test_reference_is_kept_continued_and_found_again(loaded, tmp_path):
     size = reference.pass_spp(loaded.scene)
     first = reference.render_reference(loaded, 4 * size, tmp_path)

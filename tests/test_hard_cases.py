@@ -54,9 +54,21 @@ def test_image_of_a_hard_case_is_finite_and_as_bright_as_it_must_be(case, name, 
 @pytest.mark.parametrize("name", ["plain_path", "nvc_direct", "restir_di", "nirc", "nrc", "nirc_two_level"])
 def test_what_cannot_be_rendered_is_refused_in_one_line_by_every_integrator(name):
     for case in REFUSED:
+        if stress.ENTRANTS[name].refusal(CASES[case]) is None:
+            continue
         found = stress.cell(CASES[case], stress.ENTRANTS[name], 1)
         assert CASES[case].refusal in found.get("refused", "an image"), case
         assert "\n" not in found["refused"] and len(found["refused"]) < 300
+
+
+@pytest.mark.parametrize("case", [name for name, case in CASES.items() if case.media])
+def test_plain_path_renders_the_media_that_others_refuse(case, integrators):
+    entrant = stress.ENTRANTS["plain_path"]
+    known = stress.cell(CASES[case], stress.REFERENCES["volpath"], 8, known=True)
+    found = stress.cell(CASES[case], entrant, 8, integrator=integrators["plain_path"])
+    ok, text = stress.judge(found, known, entrant, entrant.refusal(CASES[case]))
+    print(f"{case}: {text}")
+    assert ok, text
 
 
 def test_recordings_of_scenes_that_are_gone_are_not_kept(integrators):

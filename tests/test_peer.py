@@ -1,4 +1,4 @@
-"""Mitsuba's own rendering tests with our integrators in the place of `path`: `pytest -m peer`.
+"""Mitsuba's own rendering tests with our integrators in the place of `path` and `volpath`: `pytest -m peer`.
 
 The data are those of github.com/mitsuba-renderer/mitsuba-data (`tests/scenes` and `common`): references with the
 variance of each pixel. They are looked for in `../shared/peer` and where `MI_NEURAL_PEER` says; elsewhere the tests
@@ -7,6 +7,7 @@ likely than 1 % over all pixels (Šidák); 0.25 % of them may.
 """
 
 import os
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -17,20 +18,22 @@ from scipy.stats import norm
 
 DATA = Path(os.environ.get("MI_NEURAL_PEER", ROOT.parent / "shared" / "peer"))
 SCENES = sorted(DATA.glob("tests/scenes/*/*.xml"))
-#: These border a medium, or have no depth limit where the reference was rendered with one (`path` fails it, too).
+#: These border a medium: `plain_path` alone renders them.
 MEDIA = ("hetero_", "homo_")
+#: It has no depth limit where the reference was rendered with one (`path` fails it, too).
 WITHOUT_LIMIT = "test_directional_direct"
 NVC = {"type": "nvc_lights"}
 UNBIASED = {"plain_path": ("plain_path", {}), "plain_path+nvc": ("plain_path", {"light_sampler": NVC}),
             "nirc_two_level": ("nirc_two_level", {}),
             "nirc_two_level+nvc": ("nirc_two_level", {"light_sampler": NVC})}  # fmt: skip
+IN_MEDIA = ("plain_path", "plain_path+nvc")
 BIASED = ("nirc", "nrc", "neural_path")
 
 pytestmark = [pytest.mark.peer, pytest.mark.skipif(not SCENES, reason=f"Mitsuba's test scenes are not in {DATA}")]
 
 
-def of_surfaces(scenes: list[Path]) -> list:
-    chosen = [s for s in scenes if not any(f"test_{m}" in s.name for m in MEDIA)]
+def of_surfaces(scenes: list[Path], media: bool = False) -> list:
+    chosen = [s for s in scenes if any(f"test_{m}" in s.name for m in MEDIA) == media]
     return [pytest.param(s, id=s.stem) for s in chosen] or [pytest.param(None, id="none")]
 
 
@@ -53,8 +56,7 @@ def image_of(file: Path, kind: str, keys: dict, spp: int) -> np.ndarray:
         integrator = scene.integrator()
     else:
         scene = mi.load_file(str(file), spp=spp)
-        depth = {"max_depth": 2} if file.stem.endswith("_direct") else {}
-        integrator = mi.load_dict({"type": kind, **keys, **depth})
+        integrator = mi.load_dict({"type": kind, **keys, "max_depth": depth_of(scene, file)})
     integrator.render(scene, seed=0, spp=spp)
     parts = scene.sensors()[0].film().bitmap(raw=False).split()
     if len(parts) > 1:  # of `moment`: mean and square
@@ -62,6 +64,13 @@ def image_of(file: Path, kind: str, keys: dict, spp: int) -> np.ndarray:
     bitmap = parts[0][1]
     image = xyz(bitmap) if bitmap.channel_count() >= 3 else np.array(bitmap)
     return image.reshape(*image.shape[:2], -1)
+
+
+def depth_of(scene, file: Path) -> int:
+    """The depth limit of the scene's own integrator, -1 without one."""
+    limit = 2 if file.stem.endswith("_direct") else -1
+    given = re.search(r"max_depth = (\d+)", str(scene.integrator()))
+    return int(given[1]) if given and int(given[1]) < 10**6 else limit
 
 
 @pytest.mark.parametrize("name", UNBIASED)
@@ -78,6 +87,12 @@ def test_unbiased_image_passes_their_z_test(file, name):
     passing = float((p > 1 - 0.99 ** (1 / n_pixels)).mean())
     print(f"{file.stem}, {name}: {100 * passing:.3f} % of the pixels pass, mean {image.mean() / known.mean() - 1:+.4f}")
     assert passing >= 0.9975
+
+
+@pytest.mark.parametrize("name", IN_MEDIA)
+@pytest.mark.parametrize("file", of_surfaces(SCENES, media=True))
+def test_unbiased_image_of_media_passes_their_z_test(file, name):
+    test_unbiased_image_passes_their_z_test(file, name)
 
 
 @pytest.mark.parametrize("name", BIASED)

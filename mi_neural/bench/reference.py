@@ -1,5 +1,7 @@
 """The image that others are compared with: read from a file, or rendered with Mitsuba's `path` and kept.
 
+Scenes with participating media are rendered with `volpath`, which they need.
+
 A reference carries its own noise: beside the mean its file holds `variance.R G B`, the variance *of that mean*,
 estimated from the spread between passes.
 """
@@ -188,8 +190,10 @@ def reference_path(loaded: LoadedScene, folder: Path, state: str = "") -> Path:
     the scene is kept. The number of samples is not part of the name: it can grow."""
     import mitsuba as mi
 
+    from mi_neural.render.media import media_of
+
     inputs = [loaded.digest, sorted(loaded.parameters.items()), loaded.size, sorted(loaded.carried.items())]
-    inputs += [mi.__version__, *([state] if state else [])]
+    inputs += [mi.__version__, *([state] if state else []), *(["volpath"] if media_of(loaded.scene) else [])]
     key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]
     return folder / f"reference_{loaded.name}_{key}.exr"
 
@@ -202,21 +206,25 @@ def render_reference(
     seed: int = 0,
     state: str = "",
 ) -> Reference:
-    """The reference for a scene with at least `spp` samples a pixel, by Mitsuba's `path` at the scene's depth.
+    """The reference for a scene with at least `spp` samples a pixel, by Mitsuba's `path` (`volpath` where there are
+    participating media) at the scene's depth.
 
     Kept in `folder` under the name that :func:`reference_path` gives. One with enough samples is taken as it is, one
     with fewer is continued. For a scene whose parameters were changed in memory, give a `state` that tells these
     changes from others. On Ctrl-C the passes so far are written and ``KeyboardInterrupt`` goes on to the caller.
     """
+    from mi_neural.render.media import media_of
+
     path, size = reference_path(loaded, folder, state), pass_spp(loaded.scene)
     n_passes = max(2, -(-spp // size))
     moments = _Moments.resume(path, size, loaded.size)
     start = saved = clock()
     if moments.n < n_passes:
-        integrator, _ = build_integrator(IntegratorSpec("path"), loaded.carried)
+        kind = "volpath" if media_of(loaded.scene) else "path"
+        integrator, _ = build_integrator(IntegratorSpec(kind), loaded.carried)
         metadata = {
             "scene": loaded.name,
-            "integrator": "path",
+            "integrator": kind,
             "max_depth": str(loaded.carried.get("max_depth", -1)),
             "pass_spp": size,
         }

@@ -14,7 +14,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..render.frozen import undisturbed
+from ..render.media import media_of
 from ..render.sampling import PathSampler
+from ..render.tracking import shadowed
 from . import encoding
 from .field import FieldShape, TrainedField, Weights
 from .optimizer import Stride, descend
@@ -168,10 +170,12 @@ class VisibilityCache(Trainer):
     def __init__(self, training: VisibilityTraining | None = None, shape: FieldShape | None = None, seed: int = 0):
         super().__init__(training or VisibilityTraining(), seed)
         self.shape = shape
+        self.has_media = False  # in the scene of the field
 
     def start(self, scene, sensor, table, groups) -> None:
         """Make the field in the box of what the camera sees."""
         box = scene.bbox()
+        self.has_media = bool(media_of(scene, [sensor]))
         with dr.suspend_grad():
             n = 2**13
             lane = dr.arange(mi.UInt32, n)
@@ -209,7 +213,8 @@ class VisibilityCache(Trainer):
             light = groups.sample_light(group, sampler.next_1d(), mi.Bool(True))[0]
             p = dr.gather(mi.Point3f, x, step * n + point)
             ray, some = table.shadow_ray(scene, p, light, sampler.next_2d(), mi.Bool(True))
-            visible = dr.select(scene.ray_test(ray, some), mi.Float(0), 1)
+            shadow = shadowed(scene, ray, some) if self.has_media else scene.ray_test(ray, some)
+            visible = dr.select(shadow, mi.Float(0), 1)
             dr.eval(visible)
         return x, visible
 

@@ -3,8 +3,9 @@
 ``choose(si, n, transmits, u, sampler, hit, active)`` draws a light for the surface point `si` with normal `n` (a mask
 says whether light from behind counts) by the uniform number `u`, and what more it needs from `sampler`, which comes
 back advanced, in the choice. With it comes the probability of light `hit`. ``pmf(si, n, transmits, index, active)`` is
-that probability alone. Each light that can contribute keeps a positive probability, so every estimate made with any of
-them is unbiased: E[contribution(light) weight] = sum of all lights' contributions.
+that probability alone. In scenes with participating media both have the mask `around` besides: it names the points in a
+medium, which receive light from all directions alike. Each light that can contribute keeps a positive probability, so
+every estimate made with any of them is unbiased: E[contribution(light) weight] = sum of all lights' contributions.
 """
 
 from __future__ import annotations
@@ -56,12 +57,12 @@ class UniformLights:
     def __init__(self, table: LightTable):
         self.table = table
 
-    def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:
+    def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
         count = self.table.n_lights
         index = dr.minimum(mi.UInt32(u * count), count - 1)
         return Choice(index, mi.Float(count), mi.Float(1 / count), mi.Float(1 / count), sampler)
 
-    def pmf(self, si, n, transmits, index, active):
+    def pmf(self, si, n, transmits, index, active, around=None):
         return mi.Float(1 / self.table.n_lights)
 
 
@@ -78,11 +79,11 @@ class PowerLights:
         power = np.where(c["kind"] == LOCAL, np.pi * intensity, intensity * table.cross_section)
         self.groups = Groups(table, np.zeros(table.n_lights, int), power / max(power.max(initial=0), 1e-300))
 
-    def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:
+    def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
         index, pmf = self.groups.sample_light(mi.UInt32(0), u, active)
         return Choice(index, dr.rcp(pmf), pmf, dr.gather(mi.Float, self.groups.within, hit, active), sampler)
 
-    def pmf(self, si, n, transmits, index, active):
+    def pmf(self, si, n, transmits, index, active, around=None):
         return dr.gather(mi.Float, self.groups.within, index, active)
 
 
@@ -103,18 +104,18 @@ class VisibleLights:
         self.n_candidates = own(mi.UInt32(np.where(several, candidates, 1).astype(np.uint32)))
         self.facts = (candidates, self.resamples)
 
-    def weights(self, p, n, transmits) -> list:
-        """Unnormalised weight of every group for a surface at `p` with normal `n`."""
+    def weights(self, p, n, transmits, around=None) -> list:
+        """Unnormalised weight of every group for a surface at `p` with normal `n`, or for points in a medium."""
         g = self.groups
         visible = self.field.query(p) if self.field is not None else [mi.Float(1)] * g.n_groups
         weights = []
         for k, kind in enumerate(g.kind):
-            w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits)
+            w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits, around)
             weights.append(w * dr.fmax(visible[k], CELL_FLOOR if g.cell[k] else VISIBILITY_FLOOR))
         return weights
 
-    def choose(self, si, n, transmits, u, sampler, hit, active) -> Choice:
-        weights = self.weights(si.p, n, transmits)
+    def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
+        weights = self.weights(si.p, n, transmits, around)
         hit_group = dr.gather(mi.UInt32, self.groups.group_of, hit, active)
         # The light at which the running sum passes u times the total; how far beyond is the number for what follows
         total = sum(weights[1:], weights[0])
@@ -142,7 +143,7 @@ class VisibleLights:
 
         def candidate(i, best, within, w_best, w_sum, sampler):
             light, q = self.groups.sample_light(chosen, (i + sampler.next_1d()) * inv_m, active)
-            w = importance(Columns(self.table, light, None, active), si.p, n, transmits) / q
+            w = importance(Columns(self.table, light, None, active), si.p, n, transmits, around) / q
             w_sum += w
             take = sampler.next_1d() * w_sum < w
             return (i + 1, dr.select(take, light, best), dr.select(take, q, within), dr.select(take, w, w_best), w_sum,
@@ -156,10 +157,10 @@ class VisibleLights:
         weight = dr.select(pmf > 0, weight / pmf, 0)
         return Choice(index, weight, pmf * within, pmf_hit * within_hit, sampler)
 
-    def pmf(self, si, n, transmits, index, active):
+    def pmf(self, si, n, transmits, index, active, around=None):
         group = dr.gather(mi.UInt32, self.groups.group_of, index, active)
         total, w_index = mi.Float(0), mi.Float(0)
-        for k, w in enumerate(self.weights(si.p, n, transmits)):
+        for k, w in enumerate(self.weights(si.p, n, transmits, around)):
             total += w
             w_index = dr.select(group == k, w, w_index)
         pmf = dr.select(total > 0, w_index / total, 0)

@@ -377,12 +377,13 @@ def own(values):
     return values ^ dr.opaque(scalar, False) if dr.is_mask_v(values) else values + dr.opaque(scalar, 0)
 
 
-def importance(light, x, n, two_sided):
+def importance(light, x, n, two_sided, around=None):
     """Bound on what a surface at x with normal n receives of a light without shadows, up to a constant of order one.
 
     `light` has the columns kind, center, radius, axis, cone, intensity, for one light each lane. Positive wherever any
     point of the light can be seen: angles are widened by the bounding sphere's (Conty Estevez and Kulla 2018, eq. 3).
-    `two_sided` receivers (transmissive ones) count light from behind as well. Where `light.kind` is a Python number,
+    `two_sided` receivers (transmissive ones) count light from behind as well; those that the mask `around` names are
+    points in a medium, and count light from all directions alike. Where `light.kind` is a Python number,
     only its case is computed.
     """
     if isinstance(light.kind, int) and light.kind == ENVIRONMENT:
@@ -390,13 +391,14 @@ def importance(light, x, n, two_sided):
     if isinstance(light.kind, int) and light.kind == DIRECTION:
         cos = dr.dot(light.center, n)
         cos = _widen(dr.select(two_sided, dr.abs(cos), cos), light.cone, _sine(light.cone))
+        cos = cos if around is None else dr.select(around, 1, cos)
         return light.intensity * dr.maximum(cos, 0)
     if not isinstance(light.kind, int):
         cases = []
         for kind in (LOCAL, DIRECTION, ENVIRONMENT):
             one = copy.copy(light)
             one.kind = kind
-            cases.append(importance(one, x, n, two_sided))
+            cases.append(importance(one, x, n, two_sided, around))
         return dr.select(light.kind == LOCAL, cases[0], dr.select(light.kind == DIRECTION, cases[1], cases[2]))
     to = light.center - x
     d2 = dr.squared_norm(to)
@@ -408,7 +410,7 @@ def importance(light, x, n, two_sided):
     d = to * inv_d
     cos_i = dr.dot(d, n)
     cos_i = dr.select(two_sided, dr.abs(cos_i), cos_i)
-    cos_i = dr.select(inside, 1, _widen(cos_i, cos_b, sin_b))
+    cos_i = dr.select(inside if around is None else inside | around, 1, _widen(cos_i, cos_b, sin_b))
     cos_o = light.cone
     cos_l = _widen(-dr.dot(d, light.axis), cos_o, _sine(cos_o))
     cos_l = dr.select(inside | (cos_o <= -1), 1, _widen(cos_l, cos_b, sin_b))

@@ -81,15 +81,16 @@ class RaySensor:
 
     It stands for sensors that Dr.Jit cannot record, and for the unknown sensor of an integrator that is wrapped by
     another: that of the rays it is called with. A ray is chosen by the place on the film, as far as that is known: of
-    `side` x `side` rays the nearest, else any.
+    `side` x `side` rays the nearest, else any. `medium`: what the sensor is in, if it is known.
     """
 
     DRJIT_STRUCT = {"o": object, "d": object, "time": object}  # noqa: RUF012
-    side = 0
+    side, medium = 0, None
 
-    def __init__(self, ray=None, side: int = 0):
+    def __init__(self, ray=None, side: int = 0, medium=None):
         if ray is None:  # as Dr.Jit makes one
             return
+        self.medium = medium
         zero = dr.zeros(mi.Float, dr.width(ray))
         self.side = side
         self.o, self.d = mi.Point3f(dr.detach(ray.o)) + zero, mi.Vector3f(dr.detach(ray.d)) + zero
@@ -121,6 +122,9 @@ class RaySensor:
 
     def class_name(self):
         return "RaySensor"
+
+    def get_medium(self):
+        return self.medium
 
     def shutter_open(self):
         return 0.0

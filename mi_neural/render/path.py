@@ -182,46 +182,95 @@ def bounce(
     return found, sampler
 
 
+class Surface:
+    """Where :func:`direct_light` is found: a surface, in a scene without media (see :mod:`.media` for the other).
+
+    it       what light samples are seen from
+    origin   where the last scattering was, from which light samples compete with what the path met
+    in_full  whether emission that the path met counts in full, as no light sample finds it
+    around   whether it receives light from all directions alike; None: nowhere
+    """
+
+    around = None
+
+    def __init__(self, path: PathState, bsdf, found: Bounce):
+        self.it = self.origin = path.si
+        self.bsdf, self.found = bsdf, found
+        self.in_full = found.delta
+
+    def is_smooth(self):
+        """Whether light samples can contribute."""
+        return vertex.has_smooth(self.bsdf)
+
+    def seen_from(self):
+        return vertex.reference_point(self.it.p, self.it.n)
+
+    def receiver(self):
+        """See :func:`.vertex.receiver`."""
+        return vertex.receiver(self.it, self.bsdf)
+
+    def pmf_hit(self, lights, choice, hit, active):
+        """Probability that `lights` choose the light `hit`, which the path met."""
+        return choice.pmf_hit
+
+    def pdf(self):
+        """Density of the direction in which the path went on."""
+        return self.found.bs.pdf
+
+    def eval_pdf(self, d, active):
+        """Share of light from `d` that goes on along the path, and the density with which `d` is sampled."""
+        return self.bsdf.eval_pdf(mi.BSDFContext(), self.it, self.it.to_local(d), active)
+
+    def light_arriving(self, scene, tested: bool, ds, light, f, sampled, sampler):
+        """(`light` as it comes through the scene, where it is `sampled` and not shadowed, sampler). `tested`: whether a
+        shadow ray has been traced."""
+        if not tested:
+            sampled &= dr.max(f * light) > 0
+            sampled &= ~scene.ray_test(self.it.spawn_ray_to(ds.p), sampled)
+        return light, sampled, sampler
+
+
 def direct_light(
-    scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None, attached: bool = False
+    scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None, here=None,
+    attached: bool = False,
 ):  # fmt: skip
     """Both halves of direct light at a vertex: (next-event estimation, emission that the BSDF ray met, sampler).
 
-    They are weighted against each other, so that ``E[first + f/p second] = ∫ f Le cos dω``. `attached`: both have
-    derivatives with respect to BSDFs and emitters, inside of ``dr.suspend_grad()`` too, where directions and weights
-    have none; `lights` must be None.
+    They are weighted against each other, so that ``E[first + f/p second] = ∫ f Le cos dω``. `here`: what stands there,
+    in place of a :class:`Surface`. `attached`: both have derivatives with respect to BSDFs and emitters, inside of
+    ``dr.suspend_grad()`` too, where directions and weights have none; `lights` must be None, and `here` a surface.
     """
-    si, active, delta = path.si, path.active, found.delta
-    smooth = active & vertex.has_smooth(bsdf)
-    ref = vertex.reference_point(si.p, si.n)
+    here, active = here or Surface(path, bsdf, found), path.active
+    smooth = active & here.is_smooth()
+    ref = here.seen_from()
     ds_hit = mi.DirectionSample3f(scene, found.si, ref)
 
     # ------------- A light: its sample, and the density of what the BSDF ray met -------------
     if lights is None:
-        ds, light = scene.sample_emitter_direction(si, numbers.point, True, smooth)
+        ds, light = scene.sample_emitter_direction(here.it, numbers.point, here.around is None, smooth)
         pdf_light, sampled, emits = ds.pdf, smooth & (ds.pdf > 0), found.followed
-        pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~delta)
+        pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~here.in_full)
     else:
         table = lights.table
         hit, emits = table.index_of(scene, found.si, found.followed)
-        n, transmits = vertex.receiver(si, bsdf)
-        choice = lights.choose(si, n, transmits, numbers.light, sampler, hit, active)
+        n, transmits = here.receiver()
+        in_media = {} if here.around is None else {"around": here.around}
+        choice = lights.choose(here.it, n, transmits, numbers.light, sampler, hit, active, **in_media)
         sampler = choice.advanced(sampler)
-        ds, light, pdf = table.sample(scene, si, choice.index, numbers.point, smooth & (choice.weight > 0))
+        ds, light, pdf = table.sample(scene, here.it, choice.index, numbers.point, smooth & (choice.weight > 0))
         light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
-        pdf_hit = choice.pmf_hit * table.pdf(scene, si, hit, found.si, ds_hit, emits & ~delta)
+        pmf_hit = here.pmf_hit(lights, choice, hit, emits)
+        pdf_hit = pmf_hit * table.pdf(scene, here.origin, hit, found.si, ds_hit, emits & ~here.in_full)
 
     # ------------------ Both techniques, weighted against each other -------------------------
     with dr.resume_grad(when=attached):
-        f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), sampled)
+        f, pdf_bsdf = here.eval_pdf(ds.d, sampled)
         if attached:
-            emitted = scene.eval_emitter_direction(si, ds, sampled)
+            emitted = scene.eval_emitter_direction(here.it, ds, sampled)
             light = dr.replace_grad(light, emitted * dr.select(sampled, dr.rcp(ds.pdf), 0))
     pdf_bsdf = dr.detach(pdf_bsdf)
-    if lights is not None:  # the scene has traced its shadow ray already
-        sampled &= dr.max(f * light) > 0
-        sampled &= ~scene.ray_test(si.spawn_ray_to(ds.p), sampled)
+    light, sampled, sampler = here.light_arriving(scene, lights is None, ds, light, f, sampled, sampler)
     in_full = mi.Bool(ds.delta)
     if alone is not None:
         in_full |= alone(pdf_bsdf)
@@ -229,7 +278,7 @@ def direct_light(
     with dr.resume_grad(when=attached):
         L_nee = vertex.finite(f * light * w_light, sampled)
 
-    w_bsdf = dr.select(delta, 1, mis_weight(found.bs.pdf, pdf_hit))
+    w_bsdf = dr.select(here.in_full, 1, mis_weight(here.pdf(), pdf_hit))
     # What an emitter says that is not finite is seen and counted by the film, and by the training records
     with dr.resume_grad(when=attached):
         Le = dr.select(emits, found.si.emitter(scene, emits).eval(found.si, emits) * w_bsdf, 0)
