@@ -19,8 +19,8 @@ __version__ = "0.2.0"
 # Public names, and the modules that are imported when they are first used
 _LAZY = {
     "Field": "mi_neural.caches.field",
-    "denoise": "mi_neural.render.guides",
-    "guides": "mi_neural.render.guides",
+    "denoise": "mi_neural.bench.guides",
+    "guides": "mi_neural.bench.guides",
     "live": "mi_neural.explore.live",
 }
 

@@ -5,7 +5,7 @@
 For each number of samples a line: trimmed relMSE and FLIP of one image, denoised with
 
 aov         albedo and shading normal of Mitsuba's `aov`, 16 samples a pixel
-rendered    ours (mi_neural/render/guides.py), with their noise
+rendered    ours (mi_neural/bench/guides.py), with their noise
 filtered    ours, as they are used
 64          ours of 64 samples a pixel, filtered
 """
@@ -26,9 +26,8 @@ def main(scene: Path, reference: Path, spp: str = "4,32", integrator: str = "pat
     import mi_neural  # noqa: F401
 
     mi.set_variant("llvm_ad_rgb")
-    from mi_neural.bench import budget, load
+    from mi_neural.bench import budget, guides, load
     from mi_neural.image import denoise, exr, metrics
-    from mi_neural.render import guides
 
     exact = exr.read(reference)
     loaded = load.load_scene(str(scene), [exact.size], {})

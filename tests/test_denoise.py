@@ -6,9 +6,9 @@ import pytest
 
 import mi_neural
 from mi_neural import scenes
+from mi_neural.bench import guides as guides_module
 from mi_neural.image import denoise as oidn
 from mi_neural.image import metrics
-from mi_neural.render import guides as guides_module
 
 SIZE = 24
 

@@ -1,6 +1,6 @@
 """The denoiser in a comparison: its guides, and the time that it takes.
 
-The guides (:mod:`mi_neural.render.guides`) are the same for all integrators of a comparison, so that none has a better
+The guides (:mod:`mi_neural.bench.guides`) are the same for all integrators of a comparison, so that none has a better
 denoiser than another. Their time is reported apart and belongs to no integrator.
 """
 
@@ -39,7 +39,7 @@ def require() -> None:
 
 def render_guides(scene, seed: int = 0, sensor: int = 0) -> Guides:
     """Albedo and shading normals of what each pixel shows, through the scene's own film and reconstruction filter."""
-    from mi_neural.render import guides
+    from . import guides
 
     guides.guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 1))  # compiles
     start = clock()
