@@ -4,6 +4,7 @@ The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest
 """
 
 import gc
+import importlib
 import os
 import random
 import signal
@@ -78,6 +79,18 @@ def rng() -> np.random.Generator:
 def root() -> Path:
     """The root of the checkout."""
     return ROOT
+
+
+@pytest.fixture(scope="module")
+def docs_script(root):
+    """Imports a script of the folder docs by its name; none stays behind."""
+    folder, before = str(root / "docs"), set(sys.modules)
+    sys.path.insert(0, folder)
+    yield importlib.import_module
+    sys.path.remove(folder)
+    for name in set(sys.modules) - before:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(folder):
+            del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

@@ -436,7 +436,7 @@ def measured(loaded, tmp_path):
     ref = reference.render_reference(loaded, 64, tmp_path)
     specs = [load.parse_integrator(text) for text in ("path", "fake_cache:fraction=0.25")]
     cases = benchmark.make_cases(loaded, specs, {"max_depth": 4})
-    guides = denoise.render_guides(loaded.scene) if has_denoiser() else None
+    guides = denoise.render_guides(loaded.scene)[0] if has_denoiser() else None
     pictures = []
     bench = benchmark.Bench(loaded, ref, guides, {"cores": 1}, pictures.append)
     bench.run(cases, benchmark.Plan([0.05, 0.1], 3, [0.05]))
@@ -547,7 +547,7 @@ def test_denoiser_lowers_the_error(path, tmp_path):
     loaded = load.load_scene("cornell_box", (64, 64), integrator_keys={"max_depth": 4})
     ref = reference.render_reference(loaded, 64, tmp_path)
     noisy = budget.render_samples(loaded.scene, path, 2).rgb
-    clean, seconds = denoise.denoise(noisy, denoise.render_guides(loaded.scene))
+    clean, seconds = denoise.denoise(noisy, denoise.render_guides(loaded.scene)[0])
     assert seconds > 0.0 and clean.shape == noisy.shape
     assert metrics.relmse_trimmed(clean, ref.rgb) < metrics.relmse_trimmed(noisy, ref.rgb)
 

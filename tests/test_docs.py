@@ -15,15 +15,9 @@ from mi_neural.manual import pages
 
 
 @pytest.fixture(scope="module")
-def stage(root):
+def stage(docs_script):
     """The script that writes the pages, as a module."""
-    sys.path.insert(0, str(root / "docs"))
-    try:
-        yield importlib.import_module("stage")
-    finally:
-        sys.path.remove(str(root / "docs"))
-        for name in ("stage", "tables"):
-            sys.modules.pop(name, None)
+    return docs_script("stage")
 
 
 @pytest.fixture(scope="module")

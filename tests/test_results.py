@@ -1,6 +1,5 @@
 """docs/results.py: numbers of a comparison into a table."""
 
-import importlib
 import json
 import sys
 
@@ -8,12 +7,8 @@ import pytest
 
 
 @pytest.fixture(scope="module")
-def results(root):
-    sys.path.insert(0, str(root / "docs"))
-    try:
-        yield importlib.import_module("results")
-    finally:
-        sys.path.remove(str(root / "docs"))
+def results(docs_script):
+    return docs_script("results")
 
 
 @pytest.fixture

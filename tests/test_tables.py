@@ -1,20 +1,14 @@
 """Tables and figures of README and manual are those of docs/results; none with measured numbers stands elsewhere."""
 
-import importlib
 import re
 import subprocess
-import sys
 
 import pytest
 
 
 @pytest.fixture(scope="module")
-def tables(root):
-    sys.path.insert(0, str(root / "docs"))
-    try:
-        yield importlib.import_module("tables")
-    finally:
-        sys.path.remove(str(root / "docs"))
+def tables(docs_script):
+    return docs_script("tables")
 
 
 def test_pages_are_as_the_results_have_them(tables):

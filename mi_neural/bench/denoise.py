@@ -6,27 +6,13 @@ denoiser than another. Their time is reported apart and belongs to no integrator
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from mi_neural.image import denoise as oidn
 
 from .budget import STREAM_GUIDES, clock, pass_seed
+from .guides import Guides, guides
 from .load import InputError
-
-
-@dataclass(frozen=True)
-class Guides:
-    """Albedo in [0, 1] and shading normals in [-1, 1] (world space), float32 of shape (height, width, 3).
-
-    `clean`: their noise was removed. `seconds` is the wall time of making them, kernels compiled.
-    """
-
-    albedo: np.ndarray
-    normal: np.ndarray
-    clean: bool
-    seconds: float
 
 
 def require() -> None:
@@ -37,14 +23,12 @@ def require() -> None:
         raise InputError("--denoise needs Open Image Denoise; type: pip install 'mi_neural[denoise]'") from None
 
 
-def render_guides(scene, seed: int = 0, sensor: int = 0) -> Guides:
-    """Albedo and shading normals of what each pixel shows, through the scene's own film and reconstruction filter."""
-    from . import guides
-
-    guides.guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 1))  # compiles
+def render_guides(scene, seed: int = 0, sensor: int = 0) -> tuple[Guides, float]:
+    """The guides of a view, and the wall time of making them, kernels compiled."""
+    guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 1))  # compiles
     start = clock()
-    found = guides.guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 0))
-    return Guides(found.albedo, found.normal, found.clean, clock() - start)
+    found = guides(scene, sensor, pass_seed(seed, STREAM_GUIDES, 0))
+    return found, clock() - start
 
 
 def denoise(rgb: np.ndarray, guides: Guides) -> tuple[np.ndarray, float]:

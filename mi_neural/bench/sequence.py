@@ -434,7 +434,7 @@ class Run:
         if self._guides is None or self._guides[0] != state:
             first = self._guides is None
             self.sequence.apply(frame)
-            self._guides = state, denoise.render_guides(self.loaded.scene, self.plan.seed)
+            self._guides = state, denoise.render_guides(self.loaded.scene, self.plan.seed)[0]
             if first:
                 denoise.warm_up(self._guides[1])
         return self._guides[1]

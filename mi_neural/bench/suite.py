@@ -221,10 +221,10 @@ class Suite:
                 found.entries.append(page.entry(picture, exposure, most))
 
         self.bars("guides for the denoiser" if settings.denoise else "starting")
-        guides = denoise.render_guides(loaded.scene, plan.seed) if settings.denoise else None
-        if guides:
-            seconds = f"{guides.seconds:.2g} s"
-            found.notes.append(f"The guides took {seconds}, counted for nobody.")
+        guides = None
+        if settings.denoise:
+            guides, seconds = denoise.render_guides(loaded.scene, plan.seed)
+            found.notes.append(f"The guides took {seconds:.2g} s, counted for nobody.")
         shared = reference, guides
         shown = elsewhere.of_scene(settings.images, found.name)
         for picture in elsewhere.pictures(shown, loaded, reference, environment.describe()):

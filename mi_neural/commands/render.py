@@ -133,7 +133,7 @@ def render(
     with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
         if denoise_:
             bars("guides for the denoiser")
-            guides = denoise.render_guides(loaded.scene, seed)
+            guides, _ = denoise.render_guides(loaded.scene, seed)
             denoise.warm_up(guides)
         n = spp or loaded.default_spp
         if workers is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import cache
 
 import numpy as np
 
@@ -41,12 +42,18 @@ def prefilter(albedo: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.nd
         return _filtered("albedo", albedo).clip(0.0, 1.0), _filtered("normal", normal).clip(-1.0, 1.0)
 
 
+@cache
+def _device():
+    oidn = denoiser()
+    return oidn.Device(oidn.DeviceType.CPU)
+
+
 def _filtered(name: str, image: np.ndarray) -> np.ndarray:
     """`mitsuba_oidn.denoise` needs a colour image, so that a guide alone goes through the filter that it wraps."""
     oidn = denoiser()
     image = np.ascontiguousarray(image, np.float32)
     shape = {"width": image.shape[1], "height": image.shape[0], "format": oidn.Format.Float3}
-    device = oidn.Device(oidn.DeviceType.CPU)
+    device = _device()
     source, target = device.new_buffer(image.nbytes), device.new_buffer(image.nbytes)
     source.write(image)
     guide = device.new_filter("RT")
