@@ -70,6 +70,14 @@ def test_guides_hold_the_reflectance_of_what_a_pixel_shows(bsdf, albedo, unfilte
     np.testing.assert_allclose(found.normal.mean(axis=(0, 1)), expected, atol=0.02)
 
 
+def test_guides_leave_the_samples_of_the_sensor_as_they_are():
+    scene = wall(DIFFUSE)
+    sampler = scene.sensors()[0].sampler()
+    before = sampler.sample_count()
+    mi_neural.guides(scene)
+    assert sampler.sample_count() == before != guides_module.GUIDE_SPP
+
+
 @needs_denoiser
 def test_guides_of_a_blurred_view_are_filtered():
     """A lens that is out of focus: the noise of the guides is removed, or it would be taken for texture."""

@@ -63,9 +63,11 @@ def denoise(image, scene, sensor: int | mi.Sensor = 0, seed: int = 0) -> mi.Tens
 def guides(scene, sensor: int | mi.Sensor = 0, seed: int = 0) -> Guides:
     """The denoiser's guides of a view of `scene`, through the film and reconstruction filter of the sensor."""
     camera = sensor if isinstance(sensor, mi.Sensor) else scene.sensors()[sensor]
+    n_samples = camera.sampler().sample_count()  # of renderings without `spp`; Mitsuba would leave ours there
     with dr.suspend_grad():
         image = _integrator().render(scene, camera, seed=seed, spp=GUIDE_SPP, develop=True, evaluate=False)
         values = np.nan_to_num(np.array(image)[..., -6:].astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        camera.sampler().set_sample_count(n_samples)
         camera.sampler().seed(0, 1)  # or the sampler's state keeps the loop alive
     albedo = np.ascontiguousarray(values[..., :3].clip(0.0, 1.0))
     normal = np.ascontiguousarray(values[..., 3:].clip(-1.0, 1.0))
