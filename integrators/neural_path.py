@@ -15,11 +15,12 @@ from mi_neural.render.surface import scene_is_glossy, surface_of
 
 #: Queries a camera sample, at its first surface and at its end.
 QUERIES = 2.0
-#: A denoiser removes as much noise as so many times the samples, and its images have the least FLIP with this spread
-#: threshold (manual, measured).
+#: A denoiser removes as much noise as so many times the samples, and its images of few samples have the least FLIP with
+#: this spread threshold (manual, measured).
 DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
-#: Samples a pixel at which the spread threshold has grown to 1.
-FULL = 256
+#: Samples a pixel at which the spread threshold has grown to 1, and the same for an image that will be denoised: there
+#: noise counts less beside the cache's bias (studies/spread_threshold.py).
+FULL, DENOISED_FULL = 256, 16
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
@@ -43,7 +44,8 @@ class NeuralPathIntegrator(OutgoingIntegrator):
 
     def settings(self, spp: int) -> tuple:
         """Samples that the noise is averaged over, and the spread threshold."""
-        return float(spp) * (DENOISED_SAMPLES if self.denoised else 1), max(self.spread_threshold, spp / FULL)
+        noise, full = (DENOISED_SAMPLES, DENOISED_FULL) if self.denoised else (1, FULL)
+        return float(spp) * noise, max(self.spread_threshold, spp / full)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -124,8 +126,8 @@ NeuralPathIntegrator.__doc__ = (
 
      * - denoised
        - |bool|
-       - The image will be denoised: noise counts as in 100 times as many samples, and ``spread_threshold`` is 1.
-         (Default: false)
+       - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and it
+         is raised to N/16 where that is more. (Default: false)
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where

@@ -20,7 +20,7 @@ from mi_neural import scenes
 from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
-from mi_neural.integrators.neural_path import DENOISED_SAMPLES, FULL
+from mi_neural.integrators.neural_path import DENOISED_FULL, DENOISED_SAMPLES, FULL
 
 SLOW = pytest.mark.slow
 #: Caches that are trained in a second.
@@ -237,7 +237,7 @@ def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
     force(integrator)
     ours = renders(box, integrator, 24, 32)
-    c = 1.0 if denoised else 32 / FULL
+    c = 32 / (DENOISED_FULL if denoised else FULL)
     known = renders(box, outgoing_alone(trained, box, spread_threshold=c), 24, 32, first_seed=1000)
     assert_same_mean(ours, known, f"nrc, c = {c}", relative=1e-5)
 
@@ -303,8 +303,8 @@ def test_denoised_counts_noise_less(trained, box, tmp_path):
         integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels="share, depth")
         found[denoised] = render(box, integrator, 4)[..., 3:].mean(axis=(0, 1))
     n, c = auto(denoised=True).settings(4)
-    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(2 * FULL)[1] == 2.0
-    assert auto(denoised=True, spread_threshold=0.1).settings(4)[1] == 0.1
+    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(4 * DENOISED_FULL)[1] == 4.0
+    assert auto(denoised=True, spread_threshold=0.1).settings(1)[1] == 0.1
     print(f"(share, depth): {found[False]}, denoised {found[True]}")
     assert found[True][0] < 0.5 * found[False][0] and found[True][1] > found[False][1]
 
