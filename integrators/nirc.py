@@ -26,7 +26,7 @@ from mi_neural.render.sampling import PathSampler
 
 #: Caches of incident radiance without a network
 CONTROLS = {"spatial_hash": SpatialHashCache, "sh_grid": HarmonicCache}
-TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
+TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "balanced_shares")
 #: Dimensions of the stratified numbers of cache samples
 EXTRA, EXTRA_LOBE = range(paths.FREE, paths.FREE + 2)
 
@@ -40,6 +40,33 @@ class Traced:
     residual: mi.Color3f
     n_rays: mi.UInt32
     covered: mi.Float
+
+
+@dataclass
+class End:
+    """Where a path has stopped: at `position`, where the cache is asked for the light from `direction` (both in world
+    space), times the throughput `β`. A PyTree."""
+
+    position: mi.Point3f
+    normal: mi.Vector3f
+    direction: mi.Vector3f
+    β: mi.Color3f
+    queried: mi.Bool
+
+
+class Thinned(paths.Surface):
+    """A surface whose BSDF rays are followed with the probability ``keep(pdf)``: their density is so much less."""
+
+    def __init__(self, path, bsdf, found, keep):
+        super().__init__(path, bsdf, found)
+        self.keep = keep
+
+    def pdf(self):
+        return super().pdf() * self.keep(super().pdf())
+
+    def eval_pdf(self, d, active):
+        f, pdf = super().eval_pdf(d, active)
+        return f, pdf * self.keep(pdf)
 
 
 class NIRCIntegrator(CacheIntegrator):
@@ -151,7 +178,7 @@ class NIRCIntegrator(CacheIntegrator):
         """The share of far light that is gathered: with ``adaptive`` 0 for a single sample a pixel, 1/2 after
         `gather_half` more."""
         if self.termination != "adaptive":
-            return ({"primary": 0.0, "spread": 1.0, "balanced": 0.0}[self.termination],)
+            return ({"spread": 1.0}.get(self.termination, 0.0),)
         more = max(spp - 1, 0)
         return (more / (more + self.gather_half) if more else 0.0,)
 
@@ -164,6 +191,8 @@ class NIRCIntegrator(CacheIntegrator):
         path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
         si, active, n_light = path.si, path.active, self.n_light
         bsdf = si.bsdf(path.ray)
+        if self.termination == "balanced" and self.cached(field):
+            return self.balanced_path(scene, lights, field, path, sampler)
         features = field.encode(si.p, vertex.facing(si)) if self.cached(field) else None
 
         # ---------------- Samples with a ray: direct light, and what the ray meets ----------------
@@ -249,14 +278,14 @@ class NIRCIntegrator(CacheIntegrator):
         """How much of a direction's light is gathered at what it meets, instead of read from the cache here.
 
         1 for delta and sharp lobes; 1 where the next surface is so near that the cache would blur what the pixel sees
-        (spread `width` below its threshold), unless `termination` is ``primary``; elsewhere `far`, or by ``balanced``
-        its own.
+        (spread `width` below its threshold), unless `termination` is ``primary``; elsewhere `far`, or by
+        ``balanced_shares`` its own.
         """
         needed = delta | (pdf > SHARP_PDF)
         if self.termination != "primary":
             needed |= ~spread.exceeds(width, a_0, self.spread_threshold)
         share = far
-        if self.termination == "balanced":
+        if self.termination == "balanced_shares":
             share = 1 - spread.balanced_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)
 
@@ -296,6 +325,56 @@ class NIRCIntegrator(CacheIntegrator):
             (path, mi.Float(width), mi.UInt32(0), sampler), lambda path, *_: path.active, step, label="gather"
         )
         return path, n_rays, sampler
+
+    def balanced_path(self, scene, lights, field, path, sampler):
+        """A path that stops at each vertex with a probability t of its own, by what :meth:`estimate` returns.
+
+        t = Nc p_f / (Nc p_f + p_g) for the sampled BSDF direction, p_g its density; 0 for mirror lobes. Where the path
+        stops no ray is traced, and the cache answers for that direction. Direct light is estimated at each vertex, its
+        BSDF rays having the density p_g (1 - t).
+        """
+        n_cache = max(self.cache_samples, 1)
+        first = paths.stratified(sampler)
+
+        def keep(pdf):
+            return 1 - spread.balanced_probability(n_cache, pdf)
+
+        def direct(scene, lights, path, bsdf, found, numbers, sampler, alone=None):
+            here = Thinned(path, bsdf, found, keep)
+            L_nee, Le, sampler = paths.direct_light(scene, lights, path, bsdf, found, numbers, sampler, alone, here)
+            return L_nee, Le * dr.select(found.delta, 1, dr.rcp(dr.maximum(keep(found.bs.pdf), 1e-8))), sampler
+
+        def step(path, end, direct_first, is_first, sampler):
+            numbers, sampler = paths.draw_numbers(sampler)
+            numbers = dr.select(is_first, first, numbers)
+            bsdf = path.si.bsdf(path.ray)
+            sampled = paths.sample_bsdf(path.si, bsdf, numbers.lobe, numbers.direction, path.active)
+            bs, weight, delta = sampled
+            stops = path.active & ~delta & (dr.max(weight) > 0) & (sampler.next_1d() >= keep(bs.pdf))
+            found, sampler = paths.bounce(
+                scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled,
+                follow=lambda bs, delta: ~stops, direct=direct,
+            )  # fmt: skip
+            here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops)
+            end = dr.select(stops, here, end)
+            direct_first = dr.select(is_first, path.β * found.direct, direct_first)
+            path, sampler = paths.roulette(paths.advance(path, found, self.depth_limit), sampler, self.rr_depth)
+            return path, end, direct_first, mi.Bool(False), sampler
+
+        seen, n = path.L, dr.width(path.si.t)
+        none = dr.zeros(End, n)
+        path, end, direct_first, _, sampler = dr.while_loop(
+            (path, none, mi.Color3f(0), mi.Bool(True), sampler), lambda path, *_: path.active, step,
+            label="balanced termination",
+        )  # fmt: skip
+        features = field.encode(end.position, end.normal)
+        cache = dr.select(end.queried, end.β * field.query(features, end.direction), 0)
+        channels = {"direct": direct_first, "cache": cache, "residual": path.L - seen - direct_first}
+        channels |= {"depth": path.depth - dr.select(end.queried, 1.0, 0.0)}  # no ray where it stopped
+        channels |= {
+            k: dr.select(end.queried, v, 0) for k, v in sigma_channels(field, end.position, end.normal).items()
+        }
+        return path.L + cache, dr.select(path.valid, mi.Float(1), 0), channels
 
     def to_string(self):
         return (
@@ -338,8 +417,10 @@ NIRCIntegrator.__doc__ = (
      * - termination
        - |string|
        - Share of far light that is gathered. ``primary``: none, least noise, most bias. ``spread``: all, the path goes
-         on until its spread exceeds that of the pixel (Müller et al. 2021, sec. 3.4). ``balanced``: 1 - t with
-         t = Nc p_f / (Nc p_f + p_g) (Dereviannykh et al.). ``adaptive``: none for one sample a pixel, growing with the
+         on until its spread exceeds that of the pixel (Müller et al. 2021, sec. 3.4). ``balanced``: at each vertex the
+         path stops with the probability t = Nc p_f / (Nc p_f + p_g), :math:`p_f = 1/\pi`, without a ray, and the cache
+         is asked in the sampled direction (Dereviannykh et al.). ``balanced_shares``: a share of 1 - t, all rays
+         being traced: less noise a sample, more time. ``adaptive``: none for one sample a pixel, growing with the
          image's sample count, as noise gives way to bias. (Default: adaptive)
      * - cache_samples
        - |int|

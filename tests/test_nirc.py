@@ -19,7 +19,7 @@ from test_vertex import LIGHTS, lights, test_scene
 from mi_neural.caches.field import CacheFileError
 
 SLOW = pytest.mark.slow  # more of what the default run shows at one value
-TERMINATIONS = ("adaptive", "primary", "spread", "balanced")
+TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "balanced_shares")
 #: A cache that is trained in a second.
 SMALL = {"type": "nirc", "train_samples": 512, "train_frames": 60, "train_steps": 0}
 
@@ -182,6 +182,35 @@ def test_share_of_gathered_light_follows_termination_and_samples():
     assert shares == sorted(shares) and 0 <= shares[0] < 0.2 and shares[-1] > 0.99
     for n in (1, 2, 16):
         assert 0 <= nirc(gather_half=0.0).settings(n)[0] <= 1
+
+
+def test_balanced_paths_find_direct_light_as_path_does():
+    """Half of the rays that would meet the lamp are not traced; a large lamp, near a rough mirror. No light is
+    reflected twice, so that the cache has nothing to say."""
+    T = mi.ScalarTransform4f
+    black = {"type": "diffuse", "reflectance": 0.0}
+    scene = mi.load_dict({
+        "type": "scene", "floor": {"type": "rectangle", "bsdf": {"type": "roughconductor", "alpha": 0.3}},
+        "lamp": {"type": "rectangle", "bsdf": black, "emitter": {"type": "area", "radiance": 3.0},
+                 "to_world": T().translate([0, 1, 0.5]).rotate([1, 0, 0], 120)},
+        "sensor": {"type": "perspective", "to_world": T().look_at([0, -3, 2], [0, 0, 0], [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}},
+    })  # fmt: skip
+    integrator = nirc(termination="balanced", cache_samples=2, channels="depth")
+    ours = renders(scene, integrator, 24, 32)
+    path = renders(scene, {"type": "path"}, 24, 64, first_seed=1000)
+    assert_same_mean(ours, path, "direct light", relative=1e-5)
+    depth = render(scene, integrator, 32)[..., -1]
+    print(f"segments: {depth[8].mean():.2f}")
+    assert 1.05 < depth[8].mean() < 1.9
+
+
+def test_balanced_stops_and_saves_the_ray(sphere):
+    """The more the cache counts, the fewer rays; nearly all paths stop at what the camera sees with many samples."""
+    depths = [render(sphere, nirc(termination="balanced", cache_samples=n, channels="depth"), 16)[..., -1].mean()
+              for n in (1, 8, 10**6)]  # fmt: skip
+    print(f"segments {depths}")
+    assert depths[0] > 1.2 * depths[1] and abs(depths[2] - 1) < 1e-3
 
 
 # ---------------------------------------------------------------- emission once; delta chains

@@ -201,7 +201,7 @@ class Setting:
 
 #: Keys that take effect with the next image.
 SETTINGS = (
-    Setting("termination", ("adaptive", "primary", "spread", "balanced"), only=("nirc",)),
+    Setting("termination", ("adaptive", "primary", "spread", "balanced", "balanced_shares"), only=("nirc",)),
     Setting("cache_samples", (1, 2, 4, 8, 16), only=("nirc",)),
     Setting("light_samples", (-1, 1, 2, 4, 8), only=("nirc",)),
     Setting("gather_half", (0.0, 1.0, 4.0, 16.0, 64.0)),
