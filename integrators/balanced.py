@@ -1,0 +1,89 @@
+"""Paths that stop in a cache of incident radiance by chance: the balanced heuristic (Dereviannykh et al. 2025)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.caches.blend import sigma_channels
+from mi_neural.estimators import spread
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+
+
+@dataclass
+class End:
+    """Where a path has stopped: at `position`, where the cache is asked for the light from `direction` (both in world
+    space), times the throughput `β`. A PyTree."""
+
+    position: mi.Point3f
+    normal: mi.Vector3f
+    direction: mi.Vector3f
+    β: mi.Color3f
+    queried: mi.Bool
+
+
+class Thinned(paths.Surface):
+    """A surface whose BSDF rays are followed with the probability ``keep(pdf)``: their density is so much less."""
+
+    def __init__(self, path, bsdf, found, keep):
+        super().__init__(path, bsdf, found)
+        self.keep = keep
+
+    def pdf(self):
+        return super().pdf() * self.keep(super().pdf())
+
+    def eval_pdf(self, d, active):
+        f, pdf = super().eval_pdf(d, active)
+        return f, pdf * self.keep(pdf)
+
+
+def estimate(integrator, scene, lights, field, path, sampler):
+    """A path that stops at each vertex with a probability t of its own, by what an integrator's `estimate` returns.
+
+    t = Nc p_f / (Nc p_f + p_g) for the sampled BSDF direction, p_g its density; 0 for mirror lobes. Where the path
+    stops no ray is traced, and the cache answers for that direction. Direct light is estimated at each vertex, its
+    BSDF rays having the density p_g (1 - t).
+    """
+    n_cache = max(integrator.cache_samples, 1)
+    first = paths.stratified(sampler)
+
+    def keep(pdf):
+        return 1 - spread.balanced_probability(n_cache, pdf)
+
+    def direct(scene, lights, path, bsdf, found, numbers, sampler, alone=None):
+        here = Thinned(path, bsdf, found, keep)
+        L_nee, Le, sampler = paths.direct_light(scene, lights, path, bsdf, found, numbers, sampler, alone, here)
+        return L_nee, Le * dr.select(found.delta, 1, dr.rcp(dr.maximum(keep(found.bs.pdf), 1e-8))), sampler
+
+    def step(path, end, direct_first, is_first, sampler):
+        numbers, sampler = paths.draw_numbers(sampler)
+        numbers = dr.select(is_first, first, numbers)
+        bsdf = path.si.bsdf(path.ray)
+        sampled = paths.sample_bsdf(path.si, bsdf, numbers.lobe, numbers.direction, path.active)
+        bs, weight, delta = sampled
+        stops = path.active & ~delta & (dr.max(weight) > 0) & (sampler.next_1d() >= keep(bs.pdf))
+        found, sampler = paths.bounce(
+            scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled,
+            follow=lambda bs, delta: ~stops, direct=direct,
+        )  # fmt: skip
+        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops)
+        end = dr.select(stops, here, end)
+        direct_first = dr.select(is_first, path.β * found.direct, direct_first)
+        path, sampler = paths.roulette(paths.advance(path, found, integrator.depth_limit), sampler, integrator.rr_depth)
+        return path, end, direct_first, mi.Bool(False), sampler
+
+    seen, n = path.L, dr.width(path.si.t)
+    none = dr.zeros(End, n)
+    path, end, direct_first, _, sampler = dr.while_loop(
+        (path, none, mi.Color3f(0), mi.Bool(True), sampler), lambda path, *_: path.active, step,
+        label="balanced termination",
+    )  # fmt: skip
+    features = field.encode(end.position, end.normal)
+    cache = dr.select(end.queried, end.β * field.query(features, end.direction), 0)
+    channels = {"direct": direct_first, "cache": cache, "residual": path.L - seen - direct_first}
+    channels |= {"depth": path.depth - dr.select(end.queried, 1.0, 0.0)}  # no ray where it stopped
+    channels |= {k: dr.select(end.queried, v, 0) for k, v in sigma_channels(field, end.position, end.normal).items()}
+    return path.L + cache, dr.select(path.valid, mi.Float(1), 0), channels
