@@ -26,6 +26,7 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     mi.set_variant("llvm_ad_rgb")
     from mi_neural.bench import budget, load
     from mi_neural.image import exr, metrics
+    from mi_neural.integrators.neural_path import DENOISED_SAMPLES, denoised_threshold
 
     exact = exr.read(reference)
     loaded = load.load_scene(str(scene), [exact.size], {})
@@ -47,11 +48,13 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     ours, _ = load.build_integrator(load.parse_integrator("neural_path:denoised=true"), {"max_depth": max_depth})
     budget.train(loaded.scene, ours, frames)
     ours.freeze_cache = True
-    noise_counts = ours.settings(1)[0]
-    for samples in map(int, spp.split(",")):
+    ratio, spps = ours.cache.queried.grid.ratio[0], [int(n) for n in spp.split(",")]
+    ours.denoised = False  # or it would raise the thresholds by what it has measured
+    for samples in spps:
+        print(f"{loaded.name}, {samples} spp: neural_path takes c = {max(1.0, denoised_threshold(ratio, samples)):.1f}")
         line("path", path, samples)
         for c in map(float, thresholds.split(",")):
-            ours.settings = lambda n, c=c: (n * noise_counts, c)
+            ours.settings = lambda n, c=c: (n * DENOISED_SAMPLES, c)
             line(f"c = {c:g}", ours, samples)
 
 

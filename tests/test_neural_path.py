@@ -20,7 +20,7 @@ from mi_neural import scenes
 from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
-from mi_neural.integrators.neural_path import DENOISED_FULL, DENOISED_SAMPLES, FULL
+from mi_neural.integrators.neural_path import DENOISED_SAMPLES, FULL, denoised_threshold
 
 SLOW = pytest.mark.slow
 #: Caches that are trained in a second.
@@ -57,9 +57,10 @@ def trained(box):
     return integrator
 
 
-def force(integrator, noise=1.0, bias=1e9) -> None:
+def force(integrator, noise=1.0, bias=1e9, ratio=0.0) -> None:
     """Let the grid of a trained integrator say the same everywhere."""
     grid = integrator.cache.queried.grid
+    grid.ratio = mi.Float(ratio)
     grid.noise, grid.bias = (dr.full(mi.Float, v, grid.constants.n_entries) for v in (noise, bias))
     dr.make_opaque(grid)
 
@@ -150,11 +151,22 @@ def test_values_that_are_not_finite_or_huge_spoil_nothing(rng):
     assert all(np.isfinite(v).all() for v in grid.arrays().values())
 
 
+def test_ratio_is_squared_bias_over_noise(rng):
+    """Of 2^18 pairs: 0.04 over 0.25, within four standard errors of about 1 %."""
+    grid = Accuracy(*BOX)
+    assert float(grid.ratio[0]) == 0
+    observe(grid, pairs(rng, 2**18, 0.25, 0.625))  # over a prediction that is 1.25 of the truth
+    assert float(grid.ratio[0]) == pytest.approx(0.04 / 0.25, rel=0.04)
+    grid.reset()
+    assert float(grid.ratio[0]) == 0
+
+
 def test_grid_is_kept_restored_and_forgotten(rng):
     grid, other = Accuracy(*BOX), Accuracy(*BOX)
     empty = grid.arrays()
     observe(grid, pairs(rng, 4096, 0.1, 1.0))
     other.set_arrays(grid.arrays())
+    assert float(grid.ratio[0]) == float(other.ratio[0]) > 0
     np.testing.assert_array_equal(np.array(other.bias), np.array(grid.bias))
     np.testing.assert_array_equal(np.array(other.noise), np.array(grid.noise))
     grid.reset()
@@ -235,9 +247,10 @@ def test_cache_at_the_first_surface_is_nrc_with_threshold_zero(trained, box, tmp
 @pytest.mark.parametrize("denoised", [False, True])
 def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
-    force(integrator)
+    force(integrator, ratio=0.02)
     ours = renders(box, integrator, 24, 32)
-    c = 32 / (DENOISED_FULL if denoised else FULL)
+    c = denoised_threshold(0.02, 32) if denoised else 32 / FULL
+    assert (c > 5) == denoised
     known = renders(box, outgoing_alone(trained, box, spread_threshold=c), 24, 32, first_seed=1000)
     assert_same_mean(ours, known, f"nrc, c = {c}", relative=1e-5)
 
@@ -303,8 +316,8 @@ def test_denoised_counts_noise_less(trained, box, tmp_path):
         integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels="share, depth")
         found[denoised] = render(box, integrator, 4)[..., 3:].mean(axis=(0, 1))
     n, c = auto(denoised=True).settings(4)
-    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(4 * DENOISED_FULL)[1] == 4.0
-    assert auto(denoised=True, spread_threshold=0.1).settings(1)[1] == 0.1
+    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(2 * FULL)[1] == 2.0
+    assert auto(denoised=True, spread_threshold=0.1).settings(4)[1] == 0.1
     print(f"(share, depth): {found[False]}, denoised {found[True]}")
     assert found[True][0] < 0.5 * found[False][0] and found[True][1] > found[False][1]
 
