@@ -20,18 +20,17 @@ QUERIES = 2.0
 DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
 #: Samples a pixel at which the spread threshold has grown to 1.
 FULL = 256
-#: Factor of the spread threshold of an image that will be denoised, see :func:`denoised_threshold`.
-RISE = 2500
+#: Ratio b²/v from which on the spread threshold of an image that will be denoised is the largest.
+LARGE_RATIO = 0.02
 
 
 def denoised_threshold(ratio, spp):
-    """Spread threshold of an image of `spp` samples that will be denoised: ``2500 (b²/v)² sqrt(spp)``.
+    """Spread threshold of an image of `spp` samples that will be denoised: ``sqrt(spp) min(1, (ratio / 0.02)²)``.
 
-    `ratio` is b²/v, the cache's squared bias over the noise of tracing on. The form and the factor fit the best of five
-    thresholds (1 to 100) in four scenes, after 100 and 400 training frames, with 4, 16 and 64 samples
-    (studies/spread_threshold.py).
+    `ratio` is b²/v, the cache's squared bias over the noise of tracing on. Form and number fit the best of up to
+    five thresholds (1 to 100) in six scenes, with 4, 16 and 64 samples (studies/spread_threshold.py).
     """
-    return RISE * dr.square(ratio) * dr.sqrt(spp)
+    return dr.sqrt(spp) * dr.minimum(1, dr.square(ratio / LARGE_RATIO))
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
@@ -139,8 +138,8 @@ NeuralPathIntegrator.__doc__ = (
      * - denoised
        - |bool|
        - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and it
-         is raised to :math:`2500\, (b^2/v)^2 \sqrt{N}` where that is more, b²/v being the mean of the scene. (Default:
-         false)
+         is raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` where that is more, b²/v being the mean of the scene.
+         (Default: false)
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where

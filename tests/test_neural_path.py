@@ -161,6 +161,11 @@ def test_ratio_is_squared_bias_over_noise(rng):
     assert float(grid.ratio[0]) == 0
 
 
+def test_threshold_of_denoised_images_grows_with_samples_and_with_what_is_wrong():
+    assert denoised_threshold(0.0, 64) == 0 and denoised_threshold(0.02, 64) == denoised_threshold(5.0, 64) == 8
+    assert denoised_threshold(0.01, 64) == pytest.approx(2) and denoised_threshold(0.01, 16) == pytest.approx(1)
+
+
 def test_grid_is_kept_restored_and_forgotten(rng):
     grid, other = Accuracy(*BOX), Accuracy(*BOX)
     empty = grid.arrays()
