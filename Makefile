@@ -29,13 +29,13 @@ $(TESTS): $(STAMP)
 	@touch $@
 
 demo: $(STAMP)  ## path tracing beside the neural cache at equal time: table, EXR, PNG, report in out/demo
-	$(BIN)/mi-neural compare ajar_door -i path -i nirc --seconds 5 --steady 200 --frame-seconds 0.25,1 --denoise \
+	$(BIN)/mi-neural compare ajar_door -i path -i neural_path --seconds 5 --steady 200 --frame-seconds 0.25,1 --denoise \
 	    -o out/demo
 	@echo "Open out/demo/report.html"
 
 picture: demo  ## the README's picture, of the demo's frames
 	$(BIN)/python -m mi_neural.bench.montage scenes/ajar_door.png $(foreach k,steady_1s.png steady_1s_denoised.png, \
-	    out/demo/path_$(k) out/demo/nirc_$(k))
+	    out/demo/path_$(k) out/demo/neural_path_$(k))
 
 BENCH := -i path -i nirc -i nrc -i neural_path -i nirc_two_level --seconds 1 --steady 64 --frame-seconds 0.25 \
     --repeats 3 --denoise

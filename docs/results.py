@@ -6,8 +6,13 @@ the tables into the Markdown. Of other tables it prints the command. `$OUT` in a
 what was measured of a version is not measured again.
 
 `extract` names the groups of the `results.json` that `mi-neural compare` writes. A cell is the group that has all that
-its row and its column say (`rows`, `columns`: null for one that stays as it is): `scene`, `label`, `mode`,
+its row and its column say (`rows`, `columns`: null for one that stays as it is), for example `scene`, `label`, `mode`,
 `budget_seconds`, `denoised`. `values` are the fields to show and how many digits they have; `title` renames a column.
+
+Other programs write other files. `file` is then a pattern of their names in `$OUT`, and `records` the list in such a
+file whose elements take the place of groups. A record has the fields of its file beside its own; a field inside of a
+field is written with a dot (`efficiency.colours`). `each` lists what further tells the records apart that together make
+one cell. `commands` are run where one command does not measure all rows.
 """
 
 from __future__ import annotations
@@ -52,7 +57,7 @@ def not_run(found: dict) -> str:
         return "its script was not kept"
     if "extract" not in found:
         return "nothing reads its numbers yet; type by hand"
-    if "$SCENES" in found["command"] and not os.environ.get("SCENES"):
+    if "$SCENES" in " ".join(found["extract"].get("commands", [found["command"]])) and not os.environ.get("SCENES"):
         return "needs the public scenes; set SCENES to their folder and type again"
     return ""
 
@@ -69,24 +74,63 @@ def version(paths: list[str]) -> str:
 
 
 def run(found: dict) -> dict:
-    """What the command of a table measures; tables of one command share one run."""
-    commit, command = version(found["paths"]), found["command"]
-    out = OUT / hashlib.sha256(f"{commit} {command}".encode()).hexdigest()[:12]
-    done = out / "done"
-    if not done.exists():
-        out.mkdir(parents=True, exist_ok=True)
-        words = [word.replace("$OUT", str(out)).replace("$SCENES", os.environ.get("SCENES", ""))
-                 for word in shlex.split(command)]  # fmt: skip
-        print("running:", shlex.join(words), flush=True)
-        if words[0] == "mi-neural":  # of this environment
-            program = Path(sys.executable).with_name("mi-neural")
-            words[:1] = [str(program)] if program.exists() else [
-                sys.executable, "-c", "from mi_neural.cli import main; main()"]  # fmt: skip
-        status = subprocess.run(words, cwd=ROOT, env={**os.environ, "PYTHONSAFEPATH": "1"}).returncode
-        if status:
-            raise ResultsError(f"the command ended with status {status}; type the same again to go on from there")
-        done.write_text(f"{commit}\n{command}\n", encoding="utf-8")
+    """What the commands of a table measure; tables of the same commands share one run."""
+    extract = found.get("extract", {})
+    commit, commands = version(found["paths"]), extract.get("commands", [found["command"]])
+    out = OUT / hashlib.sha256(f"{commit} {' && '.join(commands)}".encode()).hexdigest()[:12]
+    for k, command in enumerate(commands):
+        done = out / ("done" if k == len(commands) - 1 else f"done_{k}")
+        if not done.exists():
+            out.mkdir(parents=True, exist_ok=True)
+            _run(command, out)
+            done.write_text(f"{commit}\n{command}\n", encoding="utf-8")
+    if "file" in extract or "records" in extract:
+        return collected(out, extract.get("file", "results.json"), extract.get("records", "groups"))
     return json.loads((out / "results.json").read_text(encoding="utf-8"))
+
+
+def _run(command: str, out: Path) -> None:
+    """One command, with `$OUT` and `$SCENES` as they are here. Raises `ResultsError` where it fails."""
+    words = [word.replace("$OUT", str(out)).replace("$SCENES", os.environ.get("SCENES", ""))
+             for word in shlex.split(command)]  # fmt: skip
+    print("running:", shlex.join(words), flush=True)
+    if words[0] == "mi-neural":  # of this environment
+        program = Path(sys.executable).with_name("mi-neural")
+        words[:1] = [str(program)] if program.exists() else [sys.executable, "-m", "mi_neural"]
+    elif words[0] == "python":
+        words[0] = sys.executable
+    status = subprocess.run(words, cwd=ROOT, env={**os.environ, "PYTHONSAFEPATH": "1"}).returncode
+    if status:
+        raise ResultsError(f"the command ended with status {status}; type the same again to go on from there")
+
+
+def collected(out: Path, pattern: str, records: str) -> dict:
+    """The records of all files of this name in `out`, as the groups of a comparison, and the last file's environment.
+
+    Raises `ResultsError` where no such file was written, or one has no such list.
+    """
+    groups, environment = [], {}
+    for file in sorted(out.glob(pattern)):
+        data = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(data.get(records), list):
+            raise ResultsError(f"{file.name} has no list '{records}'")
+        common = {key: value for key, value in data.items() if not isinstance(value, (dict, list))}
+        groups += [{**common, **_flat(record)} for record in data[records]]
+        environment = data["environment"]
+    if not groups:
+        raise ResultsError(f"the command wrote no records: there is no {pattern} in {out}")
+    return {"groups": groups, "environment": environment}
+
+
+def _flat(record: dict, before: str = "") -> dict:
+    """The record with what is inside of its fields under names with a dot; lists are left out."""
+    flat = {}
+    for key, value in record.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{before}{key}.")
+        elif not isinstance(value, list):
+            flat[before + key] = value
+    return flat
 
 
 def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
@@ -104,14 +148,25 @@ def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
                  machine=machine or f"{where['cores']} cores ({where['cpu']})")  # fmt: skip
 
 
+#: What of `extract` says nothing about which group is meant.
+SETTINGS = ("rows", "columns", "values", "title", "file", "records", "commands", "each")
+#: What messages name first.
+FIRST = ("scene", "label", "mode", "budget_seconds", "denoised")
+
+
 def cell(wanted: dict, groups: list[dict]) -> object:
-    """The numbers of the one group that has all that `wanted` says; '' where it has none of them."""
-    keys = [key for key in ("scene", "label", "mode", "budget_seconds", "denoised") if key in wanted]
-    found = [g for g in groups if all(_same(g[key], wanted[key]) for key in keys)]
-    if len(found) != 1:
-        shown = ", ".join(f"{key} {wanted[key]}" for key in keys)
-        raise ResultsError(f"{len(found)} groups of the comparison have {shown}; there must be one")
-    numbers = [_digits(found[0][name], digits) for name, digits in wanted["values"].items()]
+    """The numbers of the one group that has all that `wanted` says (with `each`: of several); '' where it has none."""
+    numbers = []
+    for further in wanted.get("each", [{}]):
+        both = {**dict.fromkeys(FIRST), **wanted, **further}
+        fields = {key: value for key, value in both.items() if key not in SETTINGS and value is not None}
+        found = [g for g in groups if all(key in g and _same(g[key], value) for key, value in fields.items())]
+        if len(found) != 1:
+            shown = ", ".join(f"{key} {value}" for key, value in fields.items())
+            raise ResultsError(f"{len(found)} groups of the comparison have {shown}; there must be one")
+        if unknown := [name for name in wanted["values"] if not any(name in g for g in groups)]:
+            raise ResultsError(f"no group of the comparison has a field {', '.join(unknown)}")
+        numbers += [_digits(found[0].get(name), digits) for name, digits in wanted["values"].items()]
     if any(number is None for number in numbers):
         return ""
     return numbers if len(numbers) > 1 else numbers[0]

@@ -404,7 +404,7 @@ class CacheIntegrator(FilmIntegrator):
     PROBES = 8
 
     def probe(self, field, x, sampler):
-        """What :meth:`measure_query` times: a position encoded once and asked in `PROBES` directions."""
+        """What :meth:`measure_query` times: a position encoded once and queried in `PROBES` directions."""
         features = field.encode(x, mi.Normal3f(0, 0, 1))
 
         def ask(i, total, sampler):

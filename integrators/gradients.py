@@ -8,7 +8,7 @@ eq. 5, after Nimier-David et al. 2020, "Radiative Backpropagation", eq. 4):
 
 The last one is the derivative at the next vertex of a path, times the throughput. The first ones need the radiance L_i
 at each vertex but not its derivative. Path replay traces it: all that lies further along the path, found by a first
-pass. Here its emission is traced, and the rest is what the cache answers, so that one pass suffices and the derivative
+pass. Here its emission is traced, and the rest is what the cache predicts, so that one pass suffices and the derivative
 at a vertex does not have the noise of the vertices behind it. E[derivative] is right if the cache is.
 """
 

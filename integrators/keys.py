@@ -88,7 +88,7 @@ SHARED_KEYS = (
      * - max_depth
        - |int|
        - Longest *traced* path in segments; -1 means no limit. Up to 2 the result is that of ``path`` (no cache is
-         asked). Beyond, light from the cache has been reflected any number of times: compare with an unlimited
+         queried). Beyond, light from the cache has been reflected any number of times: compare with an unlimited
          ``path``. (Default: -1)
      * - rr_depth
        - |int|
@@ -117,7 +117,7 @@ SHARED_KEYS = (
        - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)
      * - freeze_cache
        - |bool|
-       - Do not train at all; an untrained cache answers with a constant. (Default: false)
+       - Do not train at all; an untrained cache predicts a constant. (Default: false)
      * - gradient
        - |string|
        - Where derivatives of images come from, as in ``dr.backward(mi.render(scene, params, integrator=...))``.

@@ -34,8 +34,8 @@ EXTRA, EXTRA_LOBE = range(paths.FREE, paths.FREE + 2)
 
 @dataclass
 class Traced:
-    """Sums over the traced samples of a first vertex: direct light, what is gathered beyond the cache's answers, rays
-    beyond those of direct light, and pixels covered."""
+    """Sums over the traced samples of a first vertex: direct light, what is gathered beyond the cache's predictions,
+    rays beyond those of direct light, and pixels covered."""
 
     direct: mi.Color3f
     residual: mi.Color3f
@@ -190,7 +190,7 @@ class NIRCIntegrator(CacheIntegrator):
         return self.needs_cache and field is not None
 
     def traced_samples(self, scene, lights, field, features, path, bsdf, mixture, sampler):
-        """Sums over `n_light` BSDF samples that are traced: (:class:`Traced`, cache's answers, sampler)."""
+        """Sums over `n_light` BSDF samples that are traced: (:class:`Traced`, the cache's predictions, sampler)."""
         si, active, n_light = path.si, path.active, self.n_light
         here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
         a_0 = spread.camera_spread(dr.square(path.length), dr.dot(si.n, path.ray.d))
@@ -231,7 +231,7 @@ class NIRCIntegrator(CacheIntegrator):
         return traced, cache, sampler
 
     def cache_samples_only(self, field, features, si, bsdf, sampler, active):
-        """Sum of the cache's answers in the directions that are not traced: (sum, sampler)."""
+        """Sum of the cache's predictions in the directions that are not traced: (sum, sampler)."""
         n = max(self.cache_samples - self.n_light, 0)
         if n == 0:
             return mi.Color3f(0), sampler
@@ -348,7 +348,7 @@ NIRCIntegrator.__doc__ = (
          image's sample count, as noise gives way to bias. (Default: adaptive)
      * - cache_samples
        - |int|
-       - Directions :math:`N_c` in which the cache is asked per camera sample. 0: no cache, ``nirc`` is a path tracer.
+       - Directions :math:`N_c` in which the cache is queried per camera sample. 0: no cache, ``nirc`` is a path tracer.
          (Default: 4)
      * - cache
        - |string|

@@ -297,7 +297,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
 
 @dataclass
 class Sums:
-    """Sums over the traced samples of a first vertex: direct light, the cache's answers, the residuals of indirect
+    """Sums over the traced samples of a first vertex: direct light, the cache's predictions, the residuals of indirect
     light, and pixels covered."""
 
     direct: mi.Color3f
@@ -326,7 +326,7 @@ class _FirstVertex:
             self.features = field.encode(path.si.p, vertex.facing(path.si), self.queried)
 
     def candidate(self, lobe, direction) -> tuple:
-        """(BSDF sample, its weight, whether it is of a mirror, what the cache answers times the weight)."""
+        """(BSDF sample, its weight, whether it is of a mirror, the cache's prediction times the weight)."""
         si = self.path.si
         bs, weight, delta = paths.sample_bsdf(si, self.bsdf, lobe, direction, self.path.active)
         cached = mi.Color3f(0)
@@ -354,7 +354,7 @@ class _FirstVertex:
         ), sampler  # fmt: skip
 
     def cache_samples_only(self, n, sampler):
-        """Sum of the cache's answers in `n` directions that are not traced."""
+        """Sum of the cache's predictions in `n` directions that are not traced."""
 
         def sample(i, cache):
             numbers = sampler.stratified_1d(EXTRA_LOBE, n, i), sampler.stratified_2d(EXTRA, n, i)
@@ -365,7 +365,7 @@ class _FirstVertex:
         )[1]
 
     def resampled(self, n, sampler) -> tuple:
-        """One of `n` directions, kept in proportion to what the cache says comes from there: (sum of its answers,
+        """One of `n` directions, kept in proportion to what the cache predicts from there: (sum of its predictions,
         :meth:`candidate` with the RIS weight in it, sampler)."""
         defensive = DEFENSIVE * (self.field.scale if self.field is not None else mi.Float(1))
 
@@ -409,11 +409,11 @@ NIRCTwoLevelIntegrator.__doc__ = (
     met by a BSDF ray carries its MIS weight and is no part of the sums; mirrors and sharp lobes are always traced.
 
     On a CPU a query costs a tenth to a third of a path, and most of the variance lies in the paths' far ends, of which
-    the cache knows nothing. So this integrator *measures*: what is not given of the four keys that divide a camera
-    sample is chosen by a pilot, which renders some rows with each division and takes the one of least variance times
-    time; path tracing is among them, at its own cost, and what small images get. ``statistics()["pilot"]`` shows the
-    numbers; ``measure(scene)`` has them taken at once. Random numbers of the first vertex are stratified over a pixel's
-    samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide together where paths end.
+    the cache predicts nothing. So this integrator *measures*. Four keys divide a camera sample; those that are not set
+    are chosen by a pilot, which renders some rows with each division and takes the one of least variance times time.
+    Path tracing is one of the divisions, at its own cost; small images always get it. ``statistics()["pilot"]`` shows
+    the numbers; ``measure(scene)`` has them taken at once. Random numbers of the first vertex are stratified over a
+    pixel's samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide together where paths end.
 
     .. pluginparameters::
 
@@ -426,12 +426,12 @@ NIRCTwoLevelIntegrator.__doc__ = (
          otherwise. (Default: unbiased)
      * - cache_samples
        - |int|
-       - Directions :math:`N_c` in which the cache is asked per camera sample, those that are traced included. 0: path
+       - Directions :math:`N_c` in which the cache is queried per camera sample, those that are traced included. 0: path
          tracing. (Default: measured)
      * - residual_samples
        - |int|
        - Directions that are traced for direct light, and of which :math:`N_r` go on. (Default: measured, 1, 2 or 4; 1
-         where the cache is never asked)
+         where the cache is never queried)
      * - residual_probability
        - |float|
        - Probability, in (0, 1], with which a traced direction goes on beyond direct light: :math:`N_r` is this times
@@ -447,7 +447,7 @@ NIRCTwoLevelIntegrator.__doc__ = (
          (Default: false)
      * - ris
        - |bool|
-       - Choose the one traced direction among the ``cache_samples`` that were asked, in proportion to f cos L plus a
+       - Choose the one traced direction among the ``cache_samples`` that were queried, in proportion to f cos L plus a
          defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Was worth
          its time in one of seven scenes measured (``mi-neural doc speed``). (Default: false)
     """

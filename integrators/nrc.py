@@ -118,8 +118,8 @@ NRCIntegrator.__doc__ = (
     (RGB: the cache seen directly at the first vertex), ``depth`` (segments up to the end of the path: a heat map of
     where paths end), ``density`` (training records
     per frame near the first vertex, in a cell of 1/32 of the box), ``sigma`` and ``preference`` (of ``blend``: weight
-    of the network being trained where the cache was asked, and 1 where it exceeds 1/2). ``statistics()["loss"]`` is the
-    loss of the latest training frame, ``cache.history`` holds those of all.
+    of the network being trained where the cache was queried, and 1 where it exceeds 1/2). ``statistics()["loss"]`` is
+    the loss of the latest training frame, ``cache.history`` holds those of all.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
     participating media (use ``plain_path``), polarization, spectral rendering, and a limit to the number of bounces

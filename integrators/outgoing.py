@@ -19,7 +19,7 @@ KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cach
 OUTGOING_KEYS = """
      * - inputs
        - |string|
-       - What the network of outgoing radiance knows of a surface beside its position: a list of ``normal``, ``view``,
+       - What the network of outgoing radiance gets of a surface beside its position: a list of ``normal``, ``view``,
          ``albedo``, ``roughness``; ``plan``: what the scene needs. A cache that was loaded keeps its own. (Default:
          plan)
      * - train_suffix

@@ -35,8 +35,8 @@ LOOK_FRAMES = 32
 
 @dataclass(frozen=True)
 class Split:
-    """How a camera sample is divided: `n_cache` directions in which the cache is asked, `n_traced` for direct light, of
-    which each goes on with `probability`, and the coefficient `alpha`, negative: by place."""
+    """How a camera sample is divided: `n_cache` directions in which the cache is queried, `n_traced` for direct light,
+    of which each goes on with `probability`, and the coefficient `alpha`, negative: by place."""
 
     n_cache: int = 0
     n_traced: int = 1

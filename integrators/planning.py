@@ -46,7 +46,7 @@ def sampler_of(integrator, made: plan.ScenePlan):
 
 
 def follow(integrator, made: plan.ScenePlan) -> None:
-    """Build what a plan says. What the network of a cache that was loaded is told of surfaces stays."""
+    """Build what a plan says. The inputs of the network of a cache that was loaded stay."""
     integrator.state.plan = made
     integrator.light_sampler = sampler_of(integrator, made)
     shape = integrator.cache.shape
@@ -56,7 +56,7 @@ def follow(integrator, made: plan.ScenePlan) -> None:
 
 def fits(theirs, mine) -> bool:
     """Whether a field of shape `theirs` can take the place of one of shape `mine`: all sizes are equal. What the
-    network is told of surfaces may differ, that goes with the field."""
+    network gets as inputs may differ; that goes with the field."""
     return replace(theirs, inputs=mine.inputs) == mine if hasattr(theirs, "inputs") else theirs == mine
 
 

@@ -564,7 +564,7 @@ def _facts(table) -> tuple:
 
 
 def _remembering(lights, si, n, transmits):
-    """The same choice of lights at the same surface, again and again; a network is asked once."""
+    """The same choice of lights at the same surface, again and again; a network is queried once."""
     if not hasattr(lights, "weights"):
         return lights
     weights = lights.weights(si.p, n, transmits)

@@ -67,7 +67,7 @@ def test_extraction_of_every_table_fits_its_rows_and_columns(results):
     for table in found:
         assert len(table["extract"]["rows"]) == len(table["rows"])
         assert len(table["extract"]["columns"]) == len(table["columns"])
-        keys = ("scene", "label", "mode", "budget_seconds", "denoised", "values", "title")
+        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "values", "title", "each")
         for part in (*table["extract"]["rows"], *table["extract"]["columns"]):
             assert not set(part or {}) - set(keys)
 
@@ -83,3 +83,65 @@ def test_a_command_runs_once_and_is_read(results, table, tmp_path, monkeypatch):
     next((tmp_path / "out").glob("*/done")).unlink()
     with pytest.raises(results.ResultsError, match="status 1; type the same again"):
         results.run(asked)
+
+
+# ---------------------------------------------------------------- other programs
+
+
+def of(results, name: str) -> dict:
+    """The table of that name; its rows lose their numbers, so that all that is there afterwards was read."""
+    found = results.tables.read(name)
+    found["rows"] = [[row["cells"][0], *[""] * (len(row["cells"]) - 1)] for row in results.tables.rows(found)]
+    return found
+
+
+def test_gradients_of_the_study_are_read(results, tmp_path):
+    """As `studies/gradients.py` writes them, a file a scene; the last scene has no parameters of lamps."""
+    for k, scene in enumerate(("cornell-box", "veach-ajar", "living-room")):
+        lines = [{"integrator": name, "seconds": 0.1, "bias": 0.01 * n,
+                  "efficiency": {"colours": 1.0 + n, "others": 2.0 + k, **({"emitters": 1.44} if k < 2 else {})}}
+                 for n, name in enumerate(("prb", "nirc", "nrc"))]  # fmt: skip
+        text = json.dumps({"scene": scene, "spp": 8, "lines": lines, "rows": [], "environment": ENVIRONMENT})
+        (tmp_path / f"{scene}.json").write_text(text, encoding="utf-8")
+    table = of(results, "gradients")
+    results.fill(table, results.collected(tmp_path, "*.json", "lines"), "abc1234", None)
+    assert table["rows"][1][1:] == [["2.0", "3.0"], ["3.0", "3.0"], ["1.4", "1.4"], ["0.010", "0.020"]]
+    assert table["rows"][2][1:] == [["2.0", "3.0"], ["4.0", "4.0"], "", ["0.010", "0.020"]]
+
+
+def test_a_sequence_is_read(results, tmp_path):
+    """As `mi-neural sequence` writes it."""
+    table = of(results, "changing_scene")
+    fields = ("flip_before", "flip_first", "flip_late", "flip_area", "smape_before", "smape_late")
+    cases = [{"label": row["label"], "rows": [{"frame": 0}], "folder": "x",
+              "summary": {name: n + k / 10 for k, name in enumerate(fields)} | {"smape_mean": None}}
+             for n, row in enumerate(table["extract"]["rows"])]  # fmt: skip
+    text = json.dumps({"scene": "sun", "cases": cases, "environment": ENVIRONMENT})
+    (tmp_path / "results.json").write_text(text, encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "results.json", "cases"), "abc1234", None)
+    assert table["rows"][6][1:] == ["6.000", "6.100", "6.200", "6.3", "6.400", "6.500"]
+
+
+def test_files_without_what_is_read_are_named(results, table, tmp_path):
+    with pytest.raises(results.ResultsError, match=r"no records: there is no \*\.json"):
+        results.collected(tmp_path, "*.json", "lines")
+    (tmp_path / "a.json").write_text('{"lines": {}}', encoding="utf-8")
+    with pytest.raises(results.ResultsError, match=r"a\.json has no list 'lines'"):
+        results.collected(tmp_path, "*.json", "lines")
+    with pytest.raises(results.ResultsError, match="no group of the comparison has a field flop"):
+        results.cell({"scene": "a", "label": "path", "budget_seconds": 2, "values": {"flop": "3g"}}, GROUPS)
+
+
+def test_commands_of_one_table_run_in_turn(results, table, tmp_path, monkeypatch):
+    """The second fails at first; the one before it is not run again."""
+    written = '{"r": [{"a": 1}], "environment": {}}'
+    code = f"import pathlib, sys; pathlib.Path(sys.argv[1], sys.argv[2]).open('x').write({written!r})"
+    (tmp_path / "write.py").write_text(code, encoding="utf-8")
+    monkeypatch.setattr(results, "OUT", tmp_path / "out")
+    monkeypatch.setattr(results, "version", lambda paths: "abc1234")
+    commands = [f"python {tmp_path / 'write.py'} $OUT {name}" for name in ("1.json", "2/2.json")]
+    asked = {**table, "extract": {"file": "**/*.json", "records": "r", "commands": commands}}
+    with pytest.raises(results.ResultsError, match="status 1"):
+        results.run(asked)
+    next((tmp_path / "out").iterdir()).joinpath("2").mkdir()
+    assert [g["a"] for g in results.run(asked)["groups"]] == [1, 1]

@@ -32,6 +32,7 @@ LAYERS = [
     {"manual"},
     {"commands"},
     {"cli"},
+    {"__main__"},
 ]
 # The package's own start-up imports any room when a variant is set; others may ask it about the variant.
 STARTUP = {"", "registration"}

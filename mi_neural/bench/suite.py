@@ -224,7 +224,7 @@ class Suite:
         guides = None
         if settings.denoise:
             guides, seconds = denoise.render_guides(loaded.scene, plan.seed)
-            found.notes.append(f"The guides took {seconds:.2g} s, counted for nobody.")
+            found.notes.append(f"The guides took {seconds:.2g} s, which no row contains.")
         shared = reference, guides
         shown = elsewhere.of_scene(settings.images, found.name)
         for picture in elsewhere.pictures(shown, loaded, reference, environment.describe()):
