@@ -227,7 +227,7 @@ def test_function_of_the_users_own_may_be_frozen_around_a_trained_integrator(nam
 
 
 @pytest.mark.parametrize("integrator", ["plain_path", "nirc"])
-@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "nvc_lights"])
+@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "tree_lights", "nvc_lights"])
 def test_light_sampler_inside_a_function_of_the_users_own_says_why_not(sampler, integrator, run_python):
     """A replay would choose among the lights of the first call; in a process of its own, as it ended the process."""
     out = run_python(f"""

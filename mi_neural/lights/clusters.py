@@ -50,50 +50,17 @@ class Groups:
         within[order] = cumulative - before
         self.single = bool((count == 1).all())
 
-        weight = np.where(total[label] > 0, intensity, 1.0)
-
-        def mean(v):
-            sums = [np.bincount(label, weight * v[:, i], self.n_groups) for i in range(3)]
-            return np.stack(sums, -1) / np.bincount(label, weight, self.n_groups)[:, None]
-
-        centers = c["center"].astype(np.float64)
-        center = mean(centers)
+        b = bounds(c, label, self.n_groups, intensity)
         self.kind = [int(k) for k in c["kind"][order][start]]
         first_texel = table.sky.first if table.sky is not None else table.n_lights
         self.cell = [bool(i >= first_texel) for i in order[start]]
-        radius = np.zeros(self.n_groups)
-        np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
-        radius[[k != LOCAL for k in self.kind]] = 0
-        axis = mean(c["axis"].astype(np.float64))
-        length = np.linalg.norm(axis, axis=1)
-        axis = np.where(length[:, None] > 1e-6, axis / np.maximum(length, 1e-30)[:, None], [0, 0, 1])
-        angle = np.arccos(np.clip((c["axis"] * axis[label]).sum(axis=1), -1, 1)) + np.arccos(np.clip(c["cone"], -1, 1))
-        widest = np.zeros(self.n_groups)
-        np.maximum.at(widest, label, angle)
-        one = count == 1
-        radius[one] = c["radius"][order][start][one]
-        self.host = {"label": label, "count": count, "intensity": total, "center": center, "radius": radius}
-        cone = np.where(widest >= np.pi - 1e-3, -1.0, np.cos(widest + np.where(one, 0, 1e-4)))
-        # Lights at infinity: the angle about their mean direction
-        far = np.array([k == DIRECTION for k in self.kind])
-        length = np.linalg.norm(center, axis=1)
-        center[far] = np.where(length > 1e-6, center.T / np.maximum(length, 1e-30), [[0], [0], [1]]).T[far]
-        angle = np.arccos(np.clip((centers * center[label]).sum(axis=1), -1, 1)) + np.arccos(np.clip(c["cone"], -1, 1))
-        widest = np.zeros(self.n_groups)
-        np.maximum.at(widest, label, angle)
-        cone = np.where(far, np.cos(np.minimum(widest + np.where(one, 0, 1e-4), np.pi)), cone)
-        cone[[k == ENVIRONMENT for k in self.kind]] = -1
+        self.host = {"label": label, "count": count, "intensity": total, "center": b["center"], "radius": b["radius"]}
         vec = lambda v: own(mi.Vector3f(np.ascontiguousarray(v.T, np.float32)))  # noqa: E731
         big = np.finfo(np.float32).max
         flt = lambda v: own(mi.Float(np.ascontiguousarray(np.minimum(v, big), np.float32)))  # noqa: E731
         num = lambda v: own(mi.UInt32(np.ascontiguousarray(v, np.uint32)))  # noqa: E731
-        self.center, self.radius, self.axis, self.cone, self.intensity = (
-            vec(center),
-            flt(radius),
-            vec(axis),
-            flt(cone),
-            flt(total),
-        )
+        self.center, self.radius, self.axis = vec(b["center"]), flt(b["radius"]), vec(b["axis"])
+        self.cone, self.intensity = flt(b["cone"]), flt(total)
         self.start, self.count, self.member = num(start), num(count), num(order)
         self.within, self.cumulative, self.group_of = flt(within), flt(cumulative), num(label)
         self.search_steps = int(count.max(initial=1) - 1).bit_length()
@@ -114,6 +81,50 @@ class Groups:
         low += first
         light = dr.gather(mi.UInt32, self.member, low, active)
         return light, dr.gather(mi.Float, self.within, light, active)
+
+
+def bounds(c: dict[str, np.ndarray], label: np.ndarray, n: int, intensity: np.ndarray) -> dict[str, np.ndarray]:
+    """Sets of lights, each as one light that gives at least what any of its members gives.
+
+    `c`: columns of the lights, `label` (lights,) the set of each, of `n` sets of which none is empty, `intensity`
+    (lights,) what they count. Returns ``kind``, ``center``, ``radius``, ``axis``, ``cone``, ``intensity`` of the sets
+    as :func:`~mi_neural.lights.table.importance` reads them, float64. A set of several kinds has the last of them.
+    """
+    count, total = np.bincount(label, minlength=n), np.bincount(label, intensity, n)
+    weight = np.where(total[label] > 0, intensity, 1.0)
+    one, some = count == 1, np.zeros(n, np.int64)
+    some[label] = np.arange(len(label))
+    kind = np.zeros(n, np.uint32)
+    np.maximum.at(kind, label, c["kind"])
+
+    def mean(v):
+        sums = [np.bincount(label, weight * v[:, i], n) for i in range(3)]
+        return np.stack(sums, -1) / np.bincount(label, weight, n)[:, None]
+
+    def widest(directions, middle):
+        angle = np.arccos(np.clip((directions * middle[label]).sum(axis=1), -1, 1))
+        out = np.zeros(n)
+        np.maximum.at(out, label, angle + np.arccos(np.clip(c["cone"], -1, 1)))
+        return out + np.where(one, 0, 1e-4)
+
+    def unit(v):
+        length = np.linalg.norm(v, axis=1)[:, None]
+        return np.where(length > 1e-6, v / np.maximum(length, 1e-30), [0, 0, 1])
+
+    centers, axes = c["center"].astype(np.float64), c["axis"].astype(np.float64)
+    center, axis = mean(centers), unit(mean(axes))
+    radius = np.zeros(n)
+    np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
+    radius[one] = c["radius"][some][one]
+    radius[kind != LOCAL] = 0
+    angle = widest(axes, axis)
+    cone = np.where(angle >= np.pi - 1e-3, -1.0, np.cos(angle))
+    # Lights at infinity: the angle about their mean direction
+    far = kind == DIRECTION
+    center[far] = unit(center)[far]
+    cone = np.where(far, np.cos(np.minimum(widest(centers, center), np.pi)), cone)
+    cone[kind == ENVIRONMENT] = -1
+    return {"kind": kind, "center": center, "radius": radius, "axis": axis, "cone": cone, "intensity": total}
 
 
 def morton(points: np.ndarray) -> np.ndarray:

@@ -210,8 +210,8 @@ class Surface:
         return vertex.receiver(self.it, self.bsdf)
 
     def pmf_hit(self, lights, choice, hit, active):
-        """Probability that `lights` choose the light `hit`, which the path met."""
-        return choice.pmf_hit
+        """Probability that `lights`, which made this choice, choose the light `hit`, which the path met."""
+        return choice.of_hit(lights, self.it, *self.receiver(), hit, active)
 
     def pdf(self):
         """Density of the direction in which the path went on."""
@@ -260,8 +260,9 @@ def direct_light(
         ds, light, pdf = table.sample(scene, here.it, choice.index, numbers.point, smooth & (choice.weight > 0))
         light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
-        pmf_hit = here.pmf_hit(lights, choice, hit, emits)
-        pdf_hit = pmf_hit * table.pdf(scene, here.origin, hit, found.si, ds_hit, emits & ~here.in_full)
+        weighed = emits & ~here.in_full
+        pdf_hit = here.pmf_hit(lights, choice, hit, weighed)
+        pdf_hit *= table.pdf(scene, here.origin, hit, found.si, ds_hit, weighed)
 
     # ------------------ Both techniques, weighted against each other -------------------------
     with dr.resume_grad(when=attached):
