@@ -83,12 +83,16 @@ class Groups:
         return light, dr.gather(mi.Float, self.within, light, active)
 
 
-def bounds(c: dict[str, np.ndarray], label: np.ndarray, n: int, intensity: np.ndarray) -> dict[str, np.ndarray]:
+def bounds(
+    c: dict[str, np.ndarray], label: np.ndarray, n: int, intensity: np.ndarray, boxes: bool = False
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Sets of lights, each as one light that gives at least what any of its members gives.
 
     `c`: columns of the lights, `label` (lights,) the set of each, of `n` sets of which none is empty, `intensity`
-    (lights,) what they count. Returns ``kind``, ``center``, ``radius``, ``axis``, ``cone``, ``intensity`` of the sets
-    as :func:`~mi_neural.lights.table.importance` reads them, float64. A set of several kinds has the last of them.
+    (lights,) what they count. The spheres are centred where the light comes from in the mean or, with `boxes`, on the
+    middle of the set's box, which makes them smaller. Returns ``kind``, ``center``, ``radius``, ``axis``, ``cone``,
+    ``intensity`` of the sets as :func:`~mi_neural.lights.table.importance` reads them, float64. A set of several kinds
+    has the last of them.
     """
     count, total = np.bincount(label, minlength=n), np.bincount(label, intensity, n)
     weight = np.where(total[label] > 0, intensity, 1.0)
@@ -113,6 +117,10 @@ def bounds(c: dict[str, np.ndarray], label: np.ndarray, n: int, intensity: np.nd
 
     centers, axes = c["center"].astype(np.float64), c["axis"].astype(np.float64)
     center, axis = mean(centers), unit(mean(axes))
+    if boxes:
+        reach = c["radius"].astype(np.float64)[:, None]
+        low, high = extremes(centers - reach, centers + reach, label, n)
+        center = np.where(((kind == LOCAL) & ~one)[:, None], (low + high) / 2, center)
     radius = np.zeros(n)
     np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
     radius[one] = c["radius"][some][one]
@@ -125,6 +133,16 @@ def bounds(c: dict[str, np.ndarray], label: np.ndarray, n: int, intensity: np.nd
     cone = np.where(far, np.cos(np.minimum(widest(centers, center), np.pi)), cone)
     cone[kind == ENVIRONMENT] = -1
     return {"kind": kind, "center": center, "radius": radius, "axis": axis, "cone": cone, "intensity": total}
+
+
+def extremes(low: np.ndarray, high: np.ndarray, label: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least of `low` and most of `high` (members, 3) over each of `n` sets, (sets, 3) each; inf and -inf of sets
+    without a member."""
+    least, most = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
+    for i in range(3):
+        np.minimum.at(least[:, i], label, low[:, i])
+        np.maximum.at(most[:, i], label, high[:, i])
+    return least, most
 
 
 def morton(points: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .clusters import bounds
+from .clusters import bounds, extremes
 from .entries import OTHER, UNSAMPLED
 
 #: Planes are tried between so many slices of a node along each axis (the paper's number).
@@ -49,7 +49,7 @@ def build(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     first, n_nodes = 0, 1
     while True:
         here = {name: columns[name][lights] for name in ("kind", "center", "radius", "axis", "cone")}
-        nodes = bounds(here, label, k, power[lights])
+        nodes = bounds(here, label, k, power[lights], boxes=True)
         count = np.bincount(label, minlength=k)
         inner = count > 1
         nodes["left"] = np.where(inner, n_nodes + 2 * (np.cumsum(inner) - 1), 0)
@@ -105,7 +105,7 @@ def _sides(here: dict, power, label, n: int, halve: bool) -> np.ndarray:
 
 def _sides_of_some(here: dict, power, label, n: int, halve: bool) -> np.ndarray:
     x = here["center"].astype(np.float64)
-    low, high = _extremes(x, x, label, n)
+    low, high = extremes(x, x, label, n)
     extent = high - low
     chosen, right = np.full(n, -1), np.zeros(len(label), np.int64)  # the axis of the split, -1: none
     many = (np.bincount(label, minlength=n) > 2) & (not halve)
@@ -142,7 +142,7 @@ def _slices(x, label, low, extent) -> np.ndarray:
 
 
 def _best_planes(here, x, power, label, slices, extent) -> tuple[np.ndarray, np.ndarray]:
-    """Of each node the axis and the last slice on the left of the plane of least cost; axis -1 where none divides it."""
+    """Of each node the axis of the plane of least cost (-1: none divides it) and the last slice on its left."""
     cell = (3 * label[:, None] + np.arange(3)) * BINS + slices  # (lights, 3)
     n = len(extent)
     size = n * 3 * BINS
@@ -156,7 +156,7 @@ def _best_planes(here, x, power, label, slices, extent) -> tuple[np.ndarray, np.
     emits_to_a_side = here["cone"] > -1
     axis = [sums(power * emits_to_a_side * here["axis"][:, i]) for i in range(3)]
     reach = here["radius"].astype(np.float64)[:, None]
-    box = _extremes(np.repeat(x - reach, 3, axis=0), np.repeat(x + reach, 3, axis=0), flat, size)
+    box = extremes(np.repeat(x - reach, 3, axis=0), np.repeat(x + reach, 3, axis=0), flat, size)
     box = [v.reshape(n, 3, BINS, 3) for v in box]
     pad = 1e-3 * np.maximum(extent.max(axis=1), 1e-30)[:, None, None]
 
@@ -190,11 +190,3 @@ def _cone_measure(cos):
     sin = np.sin(θ)
     return 2 * np.pi * (1 - cos) + np.pi / 2 * (2 * θ_w * sin - np.cos(θ - 2 * θ_w) - 2 * θ * sin + cos)
 
-
-def _extremes(low, high, label, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least of `low` and most of `high` over each set, (sets, 3) each; inf and -inf of sets without a member."""
-    least, most = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
-    for i in range(3):
-        np.minimum.at(least[:, i], label, low[:, i])
-        np.maximum.at(most[:, i], label, high[:, i])
-    return least, most
