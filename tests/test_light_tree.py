@@ -188,15 +188,15 @@ def test_light_behind_the_surface_and_light_that_looks_away_have_probability_zer
 
 
 def test_the_nearest_light_is_chosen_often():
-    """Of a hundred lamps on a grid, seen from a fifth of its spacing: one time in four in the mean, and no light less
-    often than if chosen uniformly. It is not always the most frequent: the nodes above it are wide."""
+    """Of a hundred lamps on a grid, seen from a fifth of its spacing: one time in five in the mean, and no light
+    less than five times as often as if chosen uniformly. It is not always the most frequent: the nodes above it are wide."""
     table = LightTable(hall(100))
     lights_ = TreeLights(table)
     facing_down = np.flatnonzero(table.columns["axis"][:, 2] < 0)
     below = (table.columns["center"] - [0, 0, 0.08]).tolist()
     pmf = np.array([pmf_of_all(lights_, below[k], [0, 0, 1])[k] for k in facing_down[::5]])
     print(pmf.round(3))
-    assert pmf.mean() > 0.25 and pmf.min() > 0.01
+    assert pmf.mean() > 0.18 and pmf.min() > 0.05
 
 
 # ---------------------------------------------------------------- many lights, one light, dark lights
