@@ -53,9 +53,10 @@ HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_l
 def rectangle(matrix: np.ndarray, bsdf: str, radiance=None) -> str:
     """A rectangle with that 4x4 ``to_world``; where it has a radiance it shines along its normal."""
     values = " ".join(f"{v:.6g}" for v in matrix.ravel())
-    light = "" if radiance is None else (
-        '<emitter type="area"> <rgb name="radiance" value="' + ", ".join(f"{v:.5g}" for v in radiance) + '"/> </emitter>'
-    )  # fmt: skip
+    light = ""
+    if radiance is not None:
+        colour = ", ".join(f"{v:.5g}" for v in radiance)
+        light = f'<emitter type="area"> <rgb name="radiance" value="{colour}"/> </emitter>'
     return (
         f'    <shape type="rectangle"> <transform name="to_world"> <matrix value="{values}"/> </transform> '
         f'<ref id="{bsdf}"/> {light}</shape>\n'

@@ -189,7 +189,8 @@ def test_light_behind_the_surface_and_light_that_looks_away_have_probability_zer
 
 def test_the_nearest_light_is_chosen_often():
     """Of a hundred lamps on a grid, seen from a fifth of its spacing: one time in five in the mean, and no light
-    less than five times as often as if chosen uniformly. It is not always the most frequent: the nodes above it are wide."""
+    less than five times as often as if chosen uniformly. It is not always the most frequent: the nodes above it are
+    wide."""
     table = LightTable(hall(100))
     lights_ = TreeLights(table)
     facing_down = np.flatnonzero(table.columns["axis"][:, 2] < 0)
