@@ -125,9 +125,6 @@ class Place:
     def seen_from(self):
         return self.origin
 
-    def receiver(self):
-        return self.received
-
     def pmf_hit(self, lights, choice, hit, active):
         if not self.media.partial:
             return choice.of_hit(lights, self.it, *self.received, hit, active, around=self.around)
