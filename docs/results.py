@@ -82,6 +82,8 @@ def run(found: dict) -> dict:
             program = Path(sys.executable).with_name("mi-neural")
             words[:1] = [str(program)] if program.exists() else [
                 sys.executable, "-c", "from mi_neural.cli import main; main()"]  # fmt: skip
+        if words[0] == "python":
+            words[0] = sys.executable
         status = subprocess.run(words, cwd=ROOT, env={**os.environ, "PYTHONSAFEPATH": "1"}).returncode
         if status:
             raise ResultsError(f"the command ended with status {status}; type the same again to go on from there")

@@ -1,8 +1,8 @@
 """A scene of many lamps behind partitions, to compare light samplers on: ``python studies/many_lamps.py N FILE.xml``.
 
-An open-plan office of square bays, ten small coloured lamps in each: half of them hang under the ceiling and shine
-down, half stand on the floor and shine to one side. Partitions of two thirds of the height hide most lamps from any
-place. Lamps differ in power by a factor of 16. The same N gives the same file.
+A hall of square bays, ten small coloured lamps in each: half of them hang below the tops of the partitions and shine
+down, half stand on the floor and shine to one side. The partitions hide most lamps from any place. The camera looks
+down on the bays from a corner. Lamps differ in power by a factor of 16. The same N gives the same file.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-#: Metres: width of a bay, height of the ceiling and of the partitions.
-BAY, HEIGHT, PARTITION = 4.0, 3.0, 2.0
+#: Metres: width of a bay; height of the ceiling, of the partitions, and of the lamps that hang.
+BAY, HEIGHT, PARTITION, HANGING = 4.0, 8.0, 2.4, 2.0
 LAMPS_IN_A_BAY = 10
 
 HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_lamps.py {n} FILE.xml -->
@@ -25,9 +25,9 @@ HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_l
     <default name="max_depth" value="64"/>
     <integrator type="path"> <integer name="max_depth" value="$max_depth"/> </integrator>
     <sensor type="perspective">
-        <float name="fov" value="75"/>
+        <float name="fov" value="70"/>
         <transform name="to_world">
-            <lookat origin="{eye}, {eye}, 2.7" target="0, 0, 0" up="0, 0, 1"/>
+            <lookat origin="{eye}, {eye}, 7.5" target="{seen}, {seen}, 0" up="0, 0, 1"/>
         </transform>
         <sampler type="independent"> <integer name="sample_count" value="$spp"/> </sampler>
         <film type="hdrfilm">
@@ -78,7 +78,7 @@ def scene_xml(n: int) -> str:
     rng = np.random.default_rng(n)
     side = max(1, int(np.ceil(np.sqrt(n / LAMPS_IN_A_BAY))))
     half = side * BAY / 2
-    text = [HEAD.format(n=n, side=side, eye=f"{0.97 * half:.6g}")]
+    text = [HEAD.format(n=n, side=side, eye=f"{half - 0.5:.6g}", seen=f"{half - 7:.6g}")]
     text += [
         rectangle(placed([0, 0, 0], [half, 0, 0], [0, half, 0]), "floor_paint"),
         rectangle(placed([0, 0, HEIGHT], [half, 0, 0], [0, -half, 0]), "plaster"),
@@ -99,7 +99,7 @@ def scene_xml(n: int) -> str:
         size, angle = 0.05, rng.uniform(0, 2 * np.pi)
         sideways = np.array([np.cos(angle), np.sin(angle), 0])
         if k % 2:
-            matrix = placed([x, y, HEIGHT - 0.2], [size, 0, 0], [0, -size, 0])
+            matrix = placed([x, y, HANGING], [size, 0, 0], [0, -size, 0])
         else:
             matrix = placed([x, y, rng.uniform(0.4, 1.4)], size * sideways, [0, 0, size])
         colour = rng.uniform(0.4, 1, 3)
