@@ -37,7 +37,9 @@ class TreeLightSampler(LightSampler):
 
     *Works with* all emitters of Mitsuba, in RGB, mono and spectral variants, nested in an integrator of this package
     under the name ``light_sampler``. *Leaves out* adaptive splitting (several lights for one surface) and shadows:
-    where most lights are hidden from most places, ``nvc_lights`` has less noise.
+    where most lights are hidden from most places, ``nvc_lights`` has less noise. With 1,000 lamps behind partitions it
+    had 0.2 to 0.6 of this one's error in equal time, with 32 lamps 0.4 to 1.3 (``mi-neural doc lights``). Points in
+    participating media count light from all directions alike; what media absorb on the way is not known.
 
     .. tabs::
         .. code-tab:: xml

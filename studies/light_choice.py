@@ -3,8 +3,9 @@
 ``plain_path`` with each of them, and ``path``, on `lamp_bays` (32 lamps) and on the hall that ``studies/many_lamps.py``
 writes, with direct light alone (depth 2) and with all light. The methods take turns, one repeat after another, so that
 a change in the machine's load affects all of them. The references are rendered with ``tree_lights``. DIR/results.json
-has means and intervals (95 %, over the repeats), as `mi-neural compare` writes them; the same command goes on from
-where it was stopped.
+has means and intervals (95 %, over the repeats), as `mi-neural compare` writes them, and the trimmed relMSE over that
+of ``tree_lights`` in the same repeat (geometric mean, least, most), which a changing load moves less. The same command
+goes on from where it was stopped.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from mi_neural.image import exr
 
 SAMPLERS = ("uniform_lights", "power_lights", "tree_lights", "nvc_lights")
 INTEGRATORS = ("path", *(f"plain_path:light_sampler.type={name}" for name in SAMPLERS))
-#: Renders references.
-REFERENCE = "plain_path:light_sampler.type=tree_lights"
+#: What the others are compared with; renders the references, too.
+CONTROL = "plain_path:light_sampler.type=tree_lights"
 #: Passes of a reference, whose variance is taken over them.
 PASSES = 16
 DEPTHS = {"direct": 2, "all": 64}
@@ -54,14 +55,14 @@ def write_reference(file: Path, size: tuple[int, int], spp: int) -> None:
     if out.is_file():
         return
     loaded = load.load_scene(str(file), size)
-    integrator, _ = load.build_integrator(load.parse_integrator(REFERENCE), loaded.carried)
+    integrator, _ = load.build_integrator(load.parse_integrator(CONTROL), loaded.carried)
     images = []
     for k in range(PASSES):
         seed = budget.pass_seed(0, budget.STREAM_REFERENCE, k)
         image = budget.render_pass(loaded.scene, integrator, max(1, spp // PASSES), seed)
         images.append(image[..., :3].astype(np.float64))
         print(f"reference of {file.stem}: {k + 1} of {PASSES}", flush=True)
-    metadata = {"integrator": REFERENCE, "max_depth": str(loaded.carried["max_depth"]), "spp": str(spp)}
+    metadata = {"integrator": CONTROL, "max_depth": str(loaded.carried["max_depth"]), "spp": str(spp)}
     exr.write(out, np.mean(images, axis=0), exr.layer_channels("variance", np.var(images, axis=0, ddof=1) / PASSES),
               metadata)  # fmt: skip
 
@@ -86,11 +87,30 @@ def measure(files: list[Path], output: Path, options, bars) -> list[repeats.Grou
         rows += [row for found in comparison.results for row in found.rows]
         done.append(comparison)
     groups = repeats.group(rows)
-    found = {"environment": environment.describe(), "groups": [group.to_json() for group in groups]}
+    found = {"environment": environment.describe(), "groups": entries(groups)}
     exr.write_text(output / "results.json", json.dumps(found, indent=1) + "\n")
     for comparison in done:
         comparison.finish()
     return groups
+
+
+def entries(groups: list[repeats.Group]) -> list[dict]:
+    """The groups for `results.json`, each with its errors over those of `CONTROL`."""
+
+    def errors(group: repeats.Group, label: str) -> list[float]:
+        key = (group.first.scene, label, *group.key[1:])
+        return next((g.values("relmse_trimmed") for g in groups if (g.first.scene, *g.key) == key), [])
+
+    found = []
+    for group in groups:
+        own, known = errors(group, group.first.label), errors(group, CONTROL)
+        entry = group.to_json()
+        if own and len(own) == len(known):
+            over = np.array(own) / np.array(known)
+            entry |= {"over_tree": float(np.exp(np.log(over).mean())), "over_tree_least": float(over.min()),
+                      "over_tree_most": float(over.max())}  # fmt: skip
+        found.append(entry)
+    return found
 
 
 def main(arguments: list[str] | None = None) -> int:
