@@ -7,6 +7,7 @@ made under one variant still works after a visit to another.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.util
@@ -63,7 +64,8 @@ def register() -> None:
 
 
 def _own_line_last() -> None:
-    """Let the last line of an error inside of ``mi.render`` be the plugin's own.
+    """Let the last line of an error inside of ``mi.render`` be the plugin's own, and nothing be collected where it is
+    part of a function that the user freezes: memory freed in a recording ends the process.
 
     Mitsuba hands every exception on as the cause of another, "drjit.custom(...): error while performing ...": the line
     that says what to do is added as a note (Python 3.11 and newer).
@@ -74,10 +76,13 @@ def _own_line_last() -> None:
     if hasattr(render, "own_line_last") or not hasattr(BaseException, "add_note"):
         return
 
+    from .render.frozen import is_recording, undisturbed
+
     @functools.wraps(render)
     def wrapped(*args, **keys):
         try:
-            return render(*args, **keys)
+            with undisturbed() if is_recording() else contextlib.nullcontext():
+                return render(*args, **keys)
         except RuntimeError as e:
             cause = e
             while cause.__cause__ is not None:
