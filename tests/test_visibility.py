@@ -10,7 +10,9 @@ from expectation import renders
 from light_scenes import glow
 from test_light_samplers import SAMPLERS, path_with
 
-from mi_neural.caches.visibility import VisibilityCache, VisibilityTraining, surface_point
+from mi_neural.caches import visibility
+from mi_neural.caches.field import FieldShape
+from mi_neural.caches.visibility import VisibilityCache, VisibilityField, VisibilityTraining, surface_point
 from mi_neural.lights.clusters import make_groups
 from mi_neural.lights.table import LightTable
 
@@ -138,6 +140,93 @@ def test_equal_seeds_give_equal_weights_and_others_do_not():
     rms = [np.sqrt(np.mean(np.concatenate([(a[k] - x[k]).ravel() for k in a]) ** 2)) for x in (b, c)]
     print(f"rms difference: equal seeds {rms[0]:.1e}, other seeds {rms[1]:.1e}")
     assert rms[0] < 0.1 * rms[1]
+
+
+def cells_scene(n=6):
+    """`n` x `n` cells between walls, seen from above, a lamp in each: no cell sees the lamp of another. Returns (scene,
+    a point in the cell of each emitter)."""
+    T, bounds = mi.ScalarTransform4f, np.arange(n + 1) - n / 2
+    walls = {f"x{k}": T().translate([b, 1, 0]).scale([0.02, 1, n / 2]) for k, b in enumerate(bounds)}
+    walls |= {f"z{k}": T().translate([0, 1, b]).scale([n / 2, 1, 0.02]) for k, b in enumerate(bounds)}
+    centers = [(x, z) for x in bounds[:-1] + 0.5 for z in bounds[:-1] + 0.5]
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 40, "to_world": T().look_at([0, 3 * n, 0], [0, 0, 0], [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16}},
+        "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(n / 2)},
+        **{name: {"type": "cube", "to_world": place} for name, place in walls.items()},
+        **{f"lamp{k}": {"type": "point", "position": [x, 0.5, z], "intensity": 1.0}
+           for k, (x, z) in enumerate(centers)},
+    })  # fmt: skip
+    points = np.array([(x + 0.2, 0.1, z + 0.2) for x, z in centers])
+    return scene, points[[int(e.id().removeprefix("lamp")) for e in scene.emitters()]]
+
+
+def seen_and_hidden(loss: str, steps: int) -> tuple:
+    """(predictions where a lamp is seen, where it is hidden, those at the start, mean visibility) among the cells."""
+    scene, points = cells_scene()
+    place = scene, scene.sensors()[0], LightTable(scene)
+    groups = make_groups(place[-1], 64)
+    points = points[place[-1].columns["emitter"]]
+    cache = VisibilityCache(VisibilityTraining(loss=loss))
+    cache.train(*place, groups, frames=1)
+    first = said(cache, points)
+    cache.train(*place, groups, frames=steps - 1)
+    _, visible = cache._records(*place, groups, mi.UInt32([1]))
+    found, same = said(cache, points), np.eye(len(points), dtype=bool)
+    assert cache.statistics["visibility_recoveries"] == 0
+    return found[same], found[~same], first, float(dr.mean(visible)[0])
+
+
+def test_lamps_that_few_points_see_are_learned():
+    """The gradient of a squared error vanishes where the sigmoid is near 0: all outputs fell to 0 within five steps."""
+    seen, hidden, first, share = seen_and_hidden("cross_entropy", 48)
+    print(f"seen by {share:.3f}; seen {seen.min():.2f} to {seen.max():.2f}, hidden {hidden.mean():.4f}")
+    assert 0.01 < share < 0.04 and abs(first.mean() / share - 1) < 0.5
+    assert seen.min() > 0.2 and seen.mean() > 0.9 and hidden.mean() < 0.01
+
+
+def test_published_loss_and_start_are_those_of_a_key():
+    seen, hidden, first, _ = seen_and_hidden("squared", 8)
+    print(f"at the start {first.mean():.3f}; after 8 steps {seen.max():.1e}, {hidden.max():.1e}")
+    assert 0.2 < first.mean() < 0.6 and max(seen.max(), hidden.max()) < 1e-3
+    with pytest.raises(ValueError, match="loss is 'l2'; give one of: cross_entropy, squared"):
+        VisibilityTraining(loss="l2")
+    sampler = mi.load_dict({"type": "nvc_lights", "loss": "squared"})
+    assert sampler.cache.training == VisibilityTraining(loss="squared")
+    assert mi.load_dict({"type": "nvc_lights"}).cache.training.loss == "cross_entropy"
+    with pytest.raises(RuntimeError, match="nvc_lights: loss is 'l2'"):
+        mi.load_dict({"type": "nvc_lights", "loss": "l2"})
+
+
+def gradients(loss: str, visible: np.ndarray) -> tuple:
+    """(what a step reports, derivatives of the loss by the biases of the outputs, predictions) at some points."""
+    n = visible.shape[1]
+    field = VisibilityField([0] * 3, [1] * 3, FieldShape(n_levels=2, direction_degree=-1, n_outputs=len(visible)))
+    x = mi.Point3f(*np.random.default_rng(0).random((3, n), np.float32))
+    predicted, found = np.array([np.array(v) for v in field.query(x)]), {}
+
+    def descend(optimizer, losses, averaged, *_):
+        dr.backward(losses)
+        last = [k for k in optimizer if k.endswith("bias")][-1]
+        found["gradient"] = np.array(dr.grad(optimizer[last]))
+        return averaged, dr.sum(dr.detach(losses))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(visibility, "descend", descend)
+        value = field.step(x, mi.TensorXf(visible), mi.Float(0), mi.Float(0), loss)
+    return float(value[0]), found["gradient"], predicted
+
+
+def test_gradients_are_those_of_the_loss():
+    """Both losses report the mean squared error, p being a sigmoid: d/dv of the cross-entropy is p - t."""
+    visible = np.random.default_rng(1).integers(0, 2, (3, 64)).astype(np.float32)
+    for loss in ("squared", "cross_entropy"):
+        value, gradient, p = gradients(loss, visible)
+        error = p - visible
+        known = error if loss == "cross_entropy" else 2 * error * p * (1 - p)
+        np.testing.assert_allclose(gradient, known.sum(axis=1) / visible.size, rtol=1e-3, atol=1e-5, err_msg=loss)
+        assert value == pytest.approx((error**2).mean(), rel=1e-3)
 
 
 def test_steps_taken_together_are_those_taken_one_by_one():

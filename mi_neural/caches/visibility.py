@@ -19,7 +19,7 @@ from ..render.sampling import PathSampler
 from ..render.tracking import shadowed
 from . import encoding
 from .field import FieldShape, TrainedField, Weights
-from .optimizer import Stride, descend
+from .optimizer import Stride, descend, own_copy
 from .schedule import Ramp
 from .trainer import Trainer, found
 from .voxels import Ages
@@ -28,16 +28,30 @@ from .voxels import Ages
 BATCH = 8
 #: To find a normal, rays start so far beside, as a share of their length; and the steepest surface, as a tangent.
 BESIDE, STEEPEST = 1e-3, 30.0
+#: What training lessens; the second is the seed's.
+LOSSES = ("cross_entropy", "squared")
 
 
 @dataclass(frozen=True)
 class VisibilityTraining(Ramp):
-    """Constants of training, see :class:`~mi_neural.caches.schedule.Ramp`; points: see `training_points`."""
+    """Constants of training, see :class:`~mi_neural.caches.schedule.Ramp`; points: see `training_points`.
+
+    loss  ``cross_entropy``: of the visibility, ``-t log V - (1 - t) log(1 - V)``, the outputs beginning at the mean
+          visibility of their lights; ``squared``: ``(V - t)²`` as published, beginning at about 1/2. Its gradient
+          vanishes where the sigmoid is near 0 or 1: where each light is seen by few points all outputs fell to 0 within
+          five steps, and stayed there
+    """
 
     n_points: int = 2048
     ema_decay: float = 0.9
     first_rate: float = 0.05
     last_rate: float = 0.001
+    loss: str = "cross_entropy"
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.loss not in LOSSES:
+            raise ValueError(f"loss is '{self.loss}'; give one of: {', '.join(LOSSES)}")
 
 
 class VisibilityField(TrainedField):
@@ -72,16 +86,35 @@ class VisibilityField(TrainedField):
     def _encode(self, weights: Weights, x) -> list:
         return list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
 
-    def step(self, x, visible, learning_rate, decay):
-        """One step of Adam on ``mean (V(x) - visible)²``; `visible` is a tensor (n_outputs, points). Returns the loss.
+    def begin_at(self, visible) -> None:
+        """Have outputs begin at the mean of what they are to learn: `visible` is a tensor (n_outputs, points).
+
+        Such a mean is at most so near 0 or 1 as half a point in all would bring it."""
+        n = visible.shape[1]
+        seen = dr.sum(visible, axis=1)
+        for weights in (self.current, self.averaged):
+            parameters = {k: own_copy(v) for k, v in weights.parameters().items()}
+            last = [k for k in parameters if k.endswith("bias")][-1]
+            parameters[last] = own_copy(dr.log((seen + 0.5) / (n - seen + 0.5)))
+            weights.assign(parameters)
+        self._attach_optimizer()
+
+    def step(self, x, visible, learning_rate, decay, loss: str = "squared"):
+        """One step of Adam on the mean `loss` of V(x), one of `LOSSES`; `visible` is a tensor (n_outputs, points).
+        Returns the mean squared error, whatever the loss.
 
         Queries use ``averaged <- decay averaged + (1 - decay) trained``.
         """
         weights, n = self.trainable(), dr.width(x)
         out = weights.differentiable(self._encode(weights, x))
         lane = dr.arange(mi.UInt32, n)
-        errors = [dr.square(_sigmoid(v) - dr.gather(mi.Float, visible.array, lane + k * n)) for k, v in enumerate(out)]
-        losses = sum(errors[1:], errors[0]) * (1 / (n * len(out)))
+        losses = mi.Float(0)
+        for k, v in enumerate(out):
+            error = _sigmoid(v) - dr.gather(mi.Float, visible.array, lane + k * n)
+            # The gradient of the cross-entropy by v is the error itself
+            gradient = v * dr.detach(error) if loss == "cross_entropy" else dr.square(error)
+            losses += dr.replace_grad(dr.square(error), gradient)
+        losses *= 1 / (n * len(out))
         averaged, loss = descend(
             self.optimizer, losses, self.averaged.parameters(), learning_rate, decay, self.stride
         )
@@ -222,7 +255,7 @@ class VisibilityCache(Trainer):
         with dr.suspend_grad():
             learning_rate, decay = self.pace(ages, x, mi.Bool(True), rate_factor, field)
         visible = mi.TensorXf(visible, shape=(field.shape.n_outputs, dr.width(x)))
-        return found(field.step(x, visible, learning_rate, decay), ages)
+        return found(field.step(x, visible, learning_rate, decay, self.training.loss), ages)
 
     def train_step(self, scene, sensor, table, groups, batch: int = 1) -> None:
         """So many steps, each on fresh points, which are found together."""
@@ -231,7 +264,10 @@ class VisibilityCache(Trainer):
         with undisturbed():
             points = self._records(scene, sensor, table, groups, seeds)
         for k in range(batch):
-            self.step("frame", None, self.field, *_part(points, k, batch), self.ages)
+            x, visible = _part(points, k, batch)
+            if self.steps == 0 and self.training.loss == "cross_entropy":
+                self.field.begin_at(mi.TensorXf(visible, shape=(groups.n_groups, self.training.n_points)))
+            self.step("frame", None, self.field, x, visible, self.ages)
 
     def train(self, scene, sensor, table, groups, *, frames: int = 1) -> None:
         """So many steps, each on fresh points."""
