@@ -16,8 +16,9 @@ class Groups:
 
     As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in a Python list
     `kind`, and in arrays. `cell`: which groups are parts of the environment. `start`, `count`: its range in `member`,
-    the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity),
-    `cumulative` its running sum over `member`; `group_of` leads from light to group. `facts`: see the light table.
+    the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity, or
+    with `equal` the same for all), `cumulative` its running sum over `member`; `group_of` leads from light to group.
+    `facts`: see the light table.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -26,7 +27,7 @@ class Groups:
         "facts": object,
     }  # fmt: skip
 
-    def __init__(self, table: LightTable, label: np.ndarray, intensity: np.ndarray | None = None):
+    def __init__(self, table: LightTable, label: np.ndarray, intensity: np.ndarray | None = None, equal: bool = False):
         c = table.columns
         label = np.unique(label, return_inverse=True)[1].ravel()
         self.n_groups = int(label.max(initial=-1)) + 1
@@ -37,9 +38,8 @@ class Groups:
         intensity = np.maximum((c["intensity"] if intensity is None else intensity).astype(np.float64), 0)
         total = np.bincount(label, intensity, self.n_groups)
         # No light is left out: a tenth is shared equally, so that a dark mean hides no bright part
-        within = (
-            0.9 * intensity / np.where(total > 0, total, 1)[label] + np.where(total > 0, 0.1, 1)[label] / count[label]
-        )
+        share = np.where((total > 0) & (not equal), 0.1, 1)[label]
+        within = (1 - share) * intensity / np.where(total > 0, total, 1)[label] + share / count[label]
         cumulative = np.cumsum(within[order])
         cumulative -= (cumulative[start] - within[order][start])[label[order]]
         cumulative[start + count - 1] = 1.0
@@ -156,18 +156,20 @@ def morton(points: np.ndarray) -> np.ndarray:
     return code
 
 
-def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0, n_cells: int = 32) -> Groups:
+def make_groups(
+    table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0, n_cells: int = 32, equal: bool = False
+) -> Groups:  # fmt: skip
     """Groups of a table: each light alone if they are no more than `n_outputs`, else clusters.
 
     `method`: ``emitter`` (all triangles of an emitter together), ``kmeans``, or ``auto``: by emitter where they are
     few enough and small, else k-means. Lights at infinity are always alone. The texels of an
-    environment, if the table has them, make up to `n_cells` groups more.
+    environment, if the table has them, make up to `n_cells` groups more. `equal`: see :class:`Groups`.
     """
     lights = {k: v[: table.sky.first] for k, v in table.columns.items()} if table.sky is not None else table.columns
     label = _label_lights(lights, n_outputs, method, seed)
     if table.sky is not None:
         label = np.concatenate([label, label.max(initial=-1) + 1 + _label_texels(table.sky, n_cells, seed)])
-    return Groups(table, label)
+    return Groups(table, label, equal=equal)
 
 
 def _label_texels(sky, n_cells: int, seed: int) -> np.ndarray:

@@ -170,18 +170,21 @@ class VisibleLights:
     """Lights in proportion to what they would give the point without shadows, times their predicted visibility.
 
     All groups are looked at; where a group has several lights, one of `candidates` of them is resampled by what it
-    would give (RIS; Talbot et al. 2005). Without `field` visibility is taken to be 1.
+    would give (RIS; Talbot et al. 2005). Without `field` visibility is taken to be 1. Predictions count as at least
+    `floor`. With `visibility_alone` what groups of several lights would give does not count (the paper's choice).
     """
 
     DRJIT_STRUCT = {"table": object, "groups": object, "field": object, "n_candidates": object, "facts": object}  # noqa: RUF012
 
-    def __init__(self, table: LightTable, groups: Groups, field=None, candidates: int = 16):
+    def __init__(self, table: LightTable, groups: Groups, field=None, candidates: int = 16,
+                 floor: float = VISIBILITY_FLOOR, visibility_alone: bool = False):  # fmt: skip
         self.table, self.groups, self.field, self.candidates = table, groups, field, candidates
+        self.floor, self.several = floor, (groups.host["count"] > 1).tolist() if visibility_alone else None
         # Only what lies nearby differs within its group from point to point
         several = (groups.host["count"] > 1) & (np.array(groups.kind) == LOCAL)
         self.resamples = bool(several.any())
         self.n_candidates = own(mi.UInt32(np.where(several, candidates, 1).astype(np.uint32)))
-        self.facts = (candidates, self.resamples)
+        self.facts = (candidates, self.resamples, floor, visibility_alone)
 
     def weights(self, p, n, transmits, around=None) -> list:
         """Unnormalised weight of every group for a surface at `p` with normal `n`, or for points in a medium."""
@@ -189,8 +192,10 @@ class VisibleLights:
         visible = self.field.query(p) if self.field is not None else [mi.Float(1)] * g.n_groups
         weights = []
         for k, kind in enumerate(g.kind):
-            w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits, around)
-            weights.append(w * dr.fmax(visible[k], CELL_FLOOR if g.cell[k] else VISIBILITY_FLOOR))
+            w = mi.Float(1)
+            if self.several is None or not self.several[k]:
+                w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits, around)
+            weights.append(w * dr.fmax(visible[k], min(CELL_FLOOR, self.floor) if g.cell[k] else self.floor))
         return weights
 
     def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
