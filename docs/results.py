@@ -2,7 +2,7 @@
 
 Runs the command of each table whose file says how to read it (`extract`), writes its numbers into `docs/results`, and
 the tables into the Markdown. Of other tables it prints the command. `$OUT` in a command is a folder in `out/results`,
-`$SCENES` the folder of the public scenes, from the environment. Interrupted, it goes on from there when typed again:
+public scenes are those of `mi-neural scenes`. Interrupted, it goes on from there when typed again:
 what was measured of a version is not measured again.
 
 `extract` names the groups of the `results.json` that `mi-neural compare` writes. A cell is the group that has all that
@@ -29,6 +29,8 @@ from pathlib import Path
 
 import tables
 from tables import ROOT, Number, ResultsError
+
+from mi_neural.scenes import public
 
 OUT = ROOT / "out/results"
 
@@ -57,9 +59,10 @@ def not_run(found: dict) -> str:
         return "its script was not kept"
     if "extract" not in found:
         return "nothing reads its numbers yet; type by hand"
-    if "$SCENES" in " ".join(found["extract"].get("commands", [found["command"]])) and not os.environ.get("SCENES"):
-        return "needs the public scenes; set SCENES to their folder and type again"
-    return ""
+    commands = found["extract"].get("commands", [found["command"]])
+    named = [word for command in commands for word in shlex.split(command) if word in public.names()]
+    needed = dict.fromkeys(name.partition("/")[0] for name in named if not public.file(name).is_file())
+    return f"needs public scenes; type mi-neural scenes get {' '.join(needed)}" if needed else ""
 
 
 def version(paths: list[str]) -> str:
@@ -90,9 +93,8 @@ def run(found: dict) -> dict:
 
 
 def _run(command: str, out: Path) -> None:
-    """One command, with `$OUT` and `$SCENES` as they are here. Raises `ResultsError` where it fails."""
-    words = [word.replace("$OUT", str(out)).replace("$SCENES", os.environ.get("SCENES", ""))
-             for word in shlex.split(command)]  # fmt: skip
+    """One command, with `$OUT` as it is here. Raises `ResultsError` where it fails."""
+    words = [word.replace("$OUT", str(out)) for word in shlex.split(command)]
     print("running:", shlex.join(words), flush=True)
     if words[0] == "mi-neural":  # of this environment
         program = Path(sys.executable).with_name("mi-neural")

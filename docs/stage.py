@@ -70,6 +70,9 @@ def commands() -> str:
         command = program.get_command(context, name)
         inner = type(context)(command, info_name=name, parent=context, max_content_width=100, terminal_width=100)
         parts += ["", f"## mi-neural {name}", "", "```text", command.get_help(inner), "```"]
+        for below in getattr(command, "commands", {}).values():
+            last = type(context)(below, info_name=below.name, parent=inner, max_content_width=100, terminal_width=100)
+            parts += ["", "```text", below.get_help(last), "```"]
     return "\n".join(parts) + "\n"
 
 

@@ -6,4 +6,4 @@ The contract is that of ``mi_neural.integrators``; a module ends with ``mi.regis
 if __name__ != "mi_neural.emitters":
     raise ImportError(f"'{__name__}' is the source folder of mi_neural.emitters; type: import mi_neural.emitters")
 
-PLUGINS = ("uniform_lights", "power_lights", "nvc_lights")
+PLUGINS = ("uniform_lights", "power_lights", "tree_lights", "nvc_lights")

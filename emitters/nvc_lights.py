@@ -1,11 +1,63 @@
 """``nvc_lights``: lights by what they give, times their learned visibility."""
 
+from dataclasses import dataclass, replace
+
 import mitsuba as mi
 
 from mi_neural.caches.visibility import LOSSES, VisibilityCache, VisibilityTraining
 from mi_neural.emitters.common import LightSampler
 from mi_neural.lights import clusters
-from mi_neural.lights.sampling import VisibleLights
+from mi_neural.lights.sampling import VISIBILITY_FLOOR, VisibleLights
+
+
+@dataclass(frozen=True)
+class Constants:
+    """What a preset decides; see the keys of the same names. `clustered`: what differs where lights are clustered."""
+
+    train_frames: int = 32
+    train_samples: int = 2048
+    world_points: float = 0.25
+    vertices: int = 3
+    loss: str = "cross_entropy"
+    first_rate: float = 0.05
+    last_rate: float = 0.001
+    rate_steps: int = 200
+    averaging: float = 0.9
+    levels: int = 6
+    base_resolution: int = 8
+    level_scale: float = 1.7
+    init: str = "uniform"
+    floor: float = VISIBILITY_FLOOR
+    cluster_choice: str = "received"
+    within: str = "power"
+
+    def clustered(self) -> "Constants":
+        return self
+
+
+@dataclass(frozen=True)
+class Paper(Constants):
+    """As printed (Bokšanský and Meister 2025, sections 3.2 to 3.4, figure 5)."""
+
+    train_frames: int = 1
+    train_samples: int = 8192
+    world_points: float = 0.5
+    vertices: int = 1
+    loss: str = "squared"
+    averaging: float = 0.0
+    levels: int = 10
+    base_resolution: int = 16
+    level_scale: float = 2.0
+    init: str = "he"
+    floor: float = 0.001
+    cluster_choice: str = "visibility"
+    within: str = "uniform"
+
+    def clustered(self) -> Constants:
+        return replace(self, train_samples=49152, levels=8, base_resolution=2)
+
+
+PRESETS = {"measured": Constants(), "paper": Paper()}
 
 
 class NVCLightSampler(LightSampler):
@@ -19,15 +71,19 @@ class NVCLightSampler(LightSampler):
     the share of it that is visible from there as a small network predicts (neural visibility cache; METHODS 4 and the
     seed's eq. for p(x)):
 
-    .. math:: p_i(x) \propto E_i(x) \max(V_i(x), 0.06).
+    .. math:: p_i(x) \propto E_i(x) \max(V_i(x), f),
 
-    :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines at both ends (Conty Estevez
-    and Kulla 2018). Unbiased whatever the network says, since no light that can contribute has probability 0. With
-    more lights than ``outputs`` the network knows clusters of them: a cluster is chosen as above, then one light in it
-    by resampling ``candidates`` of its lights.
+    :math:`f` the key ``floor``. :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines
+    at both ends (Conty Estevez and Kulla 2018). Unbiased whatever the network says, since no light that can contribute
+    has probability 0. With more lights than ``outputs`` the network knows clusters of them: a cluster is chosen as
+    above, then one light in it by resampling ``candidates`` of its lights.
 
     .. pluginparameters::
 
+     * - preset
+       - |string|
+       - ``measured``: the defaults below. ``paper``: the constants as printed; keys that are given go before it. The
+         list below has both. (Default: measured)
      * - outputs
        - |int|
        - Most outputs of the network; up to that many lights are known one by one. (Default: 32)
@@ -59,6 +115,44 @@ class NVCLightSampler(LightSampler):
        - |string|
        - What training lessens: ``cross_entropy``, or ``squared`` as published, which learns nothing where each light is
          seen from few points (``mi-neural doc measured``). (Default: cross_entropy)
+     * - world_points
+       - |float|
+       - Share of these points that lie anywhere in the box of what is seen; the others lie on surfaces. (Default: 0.25)
+     * - vertices
+       - |int|
+       - Surfaces are those at the first so many vertices of paths from the camera. (Default: 3)
+     * - first_rate, last_rate
+       - |float|
+       - Learning rates of Adam at a place that is new, and at one that has been trained ``rate_steps`` times.
+         (Default: 0.05, 0.001)
+     * - rate_steps
+       - |int|
+       - Steps in which the rate falls, linearly. (Default: 200)
+     * - averaging
+       - |float|
+       - Share of the old weights in each step of the average that is used; 0: the latest weights. (Default: 0.9)
+     * - levels
+       - |int|
+       - Levels of the hash grid. (Default: 6)
+     * - base_resolution
+       - |int|
+       - Cells of the coarsest level along an axis. (Default: 8)
+     * - level_scale
+       - |float|
+       - Factor of that number from level to level. (Default: 1.7)
+     * - init
+       - |string|
+       - Of the network's weights: ``uniform`` (Dr.Jit's), or ``he``. (Default: uniform)
+     * - floor
+       - |float|
+       - Visibilities below it count as it. (Default: 0.06)
+     * - cluster_choice
+       - |string|
+       - Weight of a cluster of several lights: ``received``, what it would give times its visibility, or
+         ``visibility`` alone. (Default: received)
+     * - within
+       - |string|
+       - Candidates in a cluster: by ``power``, or ``uniform``. (Default: power)
      * - freeze
        - |bool|
        - Do not train; an untrained network says 1/2 for every light. (Default: false)
@@ -69,6 +163,28 @@ class NVCLightSampler(LightSampler):
        - |string|
        - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
          faults. (Default: scene)
+
+    The presets: what is printed (Bokšanský and Meister 2025, sections 3.2 to 3.4 and figure 5; values behind a
+    semicolon hold where lights are clustered) / the default / why it differs.
+
+    - ``train_frames``: 1 / 32 / the first image has a trained network.
+    - ``train_samples``, ``world_points``, ``vertices``: 8192, 0.5, 1; 49152 / 2048, 0.25, 3 / so spread, 2048 points a
+      step do as well as 8192.
+    - ``loss``: squared / cross_entropy / where a lamp is seen by 2 or 3 % of the points, the squared error has all
+      predictions at 0 from the fifth step on.
+    - ``first_rate``, ``last_rate``, ``rate_steps``: 0.05, 0.001, 200 / the same; in both presets the rate falls with
+      the age of a place, not with that of the network.
+    - ``averaging``: none / 0.9 / not measured.
+    - ``levels``, ``base_resolution``, ``level_scale``: 10, 16, not printed (2 taken); 8, 2 / 6, 8, 1.7 / Sponza with 32
+      lamps: variance 0.453 in 148 ms, with 10 levels from 16 on 0.514 in 160 ms.
+    - ``init``: he / uniform / not measured.
+    - ``floor``: 0.001 / 0.06 / Sponza with 32 lamps: relMSE 0.13 (trimmed 0.10), with 0.001 2.1 (0.09).
+    - ``cluster_choice``, ``within``: visibility, uniform / received, power / not measured.
+    - Weight of a light: by linearly transformed cosines / a bound on its irradiance, in both presets / the former takes
+      2 to 2.6 times as long for a variance of 0.98 (Sponza) or 0.67 (glossy lamps); there is no key for it.
+
+    The measurements are those of ``mi-neural doc measured``. Four features a level, 2^14 entries, two hidden layers of
+    32 leaky rectifiers (0.01) and the sigmoid are the paper's in both presets.
 
     *Works with* all emitters of Mitsuba; point, spot and directional lights, meshes of thousands of emissive triangles
     and the environment can be mixed. With a single light it costs nothing. Points in a participating
@@ -96,13 +212,11 @@ class NVCLightSampler(LightSampler):
         self.fixed = {key: props[key] for key in keys if key in props}
         self.candidates = props.get("candidates", 16)
         self.visibility = props.get("visibility", True)
-        self.train_frames = props.get("train_frames", 32)
         self.train_steps = props.get("train_steps", 1)
-        self.train_samples = props.get("train_samples", 2048)
-        self.loss = props.get("loss", "cross_entropy")
         self.freeze = props.get("freeze", False)
         self.seed = props.get("seed", 0)
         super().__init__(props)
+        self._read_constants(props)
         self._check(2 <= self.outputs <= 256, f"outputs is {self.outputs}; it must lie in 2..256")
         self._check(self.clusters in clusters.METHODS,
                     f"clusters is '{self.clusters}'; give one of: {', '.join(clusters.METHODS)}")  # fmt: skip
@@ -111,11 +225,50 @@ class NVCLightSampler(LightSampler):
         self._check(self.candidates >= 1, f"candidates is {self.candidates}; it must be at least 1")
         self._check(self.train_frames >= 0, f"train_frames is {self.train_frames}; it must be 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
-        self._check(self.train_samples >= 4, f"train_samples is {self.train_samples}; it must be at least 4")
-        self._check(self.loss in LOSSES, f"loss is '{self.loss}'; give one of: {', '.join(LOSSES)}")
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
-        training = VisibilityTraining(n_points=self.train_samples, loss=self.loss)
-        self.cache = VisibilityCache(training, seed=self.seed)
+        self.constants, self.cache = self.alone, self._make_cache(self.alone)
+
+    def _read_constants(self, props) -> None:
+        """Those for single lights (`alone`) and for clusters: of the preset, but for keys that are given."""
+        self.preset = props.get("preset", "measured")
+        self._check(self.preset in PRESETS, f"preset is '{self.preset}'; give one of: {', '.join(PRESETS)}")
+        preset = PRESETS[self.preset]
+        given = {
+            "train_frames": props.get("train_frames", None), "train_samples": props.get("train_samples", None),
+            "world_points": props.get("world_points", None), "vertices": props.get("vertices", None),
+            "loss": props.get("loss", None), "averaging": props.get("averaging", None),
+            "first_rate": props.get("first_rate", None), "last_rate": props.get("last_rate", None),
+            "rate_steps": props.get("rate_steps", None),
+            "levels": props.get("levels", None), "base_resolution": props.get("base_resolution", None),
+            "level_scale": props.get("level_scale", None), "init": props.get("init", None),
+            "floor": props.get("floor", None), "cluster_choice": props.get("cluster_choice", None),
+            "within": props.get("within", None),
+        }  # fmt: skip
+        given = {key: value for key, value in given.items() if value is not None}
+        self.alone, self.of_clusters = replace(preset, **given), replace(preset.clustered(), **given)
+        c = self.alone
+        self.train_frames = c.train_frames
+        ranges = {"train_samples": (4, 2**20), "world_points": (0, 1), "vertices": (1, 64), "rate_steps": (1, 2**30),
+                  "averaging": (0, 1), "levels": (1, 32), "base_resolution": (1, 4096), "floor": (1e-6, 1)}  # fmt: skip
+        for key, (low, high) in ranges.items():
+            value = getattr(c, key)
+            self._check(low <= value <= high, f"{key} is {value}; it must lie in {low}..{high}")
+        for key in ("first_rate", "last_rate"):
+            self._check(getattr(c, key) > 0, f"{key} is {getattr(c, key)}; it must be greater than 0")
+        self._check(1 < c.level_scale <= 16, f"level_scale is {c.level_scale}; it must be above 1 and at most 16")
+        choices = {"loss": LOSSES, "init": ("uniform", "he"), "cluster_choice": ("received", "visibility"),
+                   "within": ("power", "uniform")}  # fmt: skip
+        for key, names in choices.items():
+            value = getattr(c, key)
+            self._check(value in names, f"{key} is '{value}'; give one of: {', '.join(names)}")
+
+    def _make_cache(self, c: Constants) -> VisibilityCache:
+        training = VisibilityTraining(
+            n_points=c.train_samples, ema_decay=c.averaging, first_rate=c.first_rate, last_rate=c.last_rate,
+            ramp=c.rate_steps, world_points=c.world_points, vertices=c.vertices, loss=c.loss,
+        )  # fmt: skip
+        grid = {"n_levels": c.levels, "base_resolution": c.base_resolution, "per_level_scale": c.level_scale}
+        return VisibilityCache(training, seed=self.seed, grid=grid, he=c.init == "he")
 
     def reset(self) -> None:
         self.begun = False
@@ -131,15 +284,22 @@ class NVCLightSampler(LightSampler):
     def make(self, scene, table):
         try:
             cells = int(self.plan["environment_cells"])
-            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed, cells)
+            equal = self.alone.within == "uniform"
+            groups = clusters.make_groups(table, self.outputs, self.clusters, self.seed, cells, equal)
         except ValueError as e:
             raise ValueError(f"{self.plugin}: {e}") from None
+        constants = self.alone if groups.single else self.of_clusters
+        if constants != self.constants:
+            self.constants, self.begun, seed = constants, False, self.cache.seed
+            self.cache = self._make_cache(constants)
+            self.cache.seed = seed
         field = self.cache.field if self.visibility else None
         if field is not None and field.shape.n_outputs != groups.n_groups:
             self.cache.reset()  # lights appeared or went
             self.begun = False
             field = None
-        return VisibleLights(table, groups, field, self.candidates)
+        alone = constants.cluster_choice == "visibility"
+        return VisibleLights(table, groups, field, self.candidates, constants.floor, alone)
 
     def given(self) -> dict:
         return self.fixed

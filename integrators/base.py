@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from contextlib import nullcontext
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +12,7 @@ from mi_neural.integrators.checks import check_film, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
-from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording
+from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.sampling import PathSampler
 
 
@@ -107,7 +108,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
                 "integrator.train(scene, 300), and make the integrator with train_steps=0"
             )
         spp = spp or sensor.sampler().sample_count()
-        with LOCK, dr.suspend_grad():
+        # A user's recording, too, ends with the process where memory is freed in it
+        with LOCK, dr.suspend_grad(), undisturbed() if is_recording() else nullcontext():
             self.bind(scene, sensor)
             block = self._render(scene, sensor, as_seed(seed), spp)
             film = sensor.film()

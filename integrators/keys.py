@@ -5,8 +5,8 @@ import mitsuba as mi
 LIGHT_SAMPLER_KEY = """
      * - light_sampler
        - |emitter|
-       - Nested plugin that chooses the light of each shadow ray: ``uniform_lights``, ``power_lights``, ``nvc_lights``.
-         (Default: the scene's own choice, as in ``path``)
+       - Nested plugin that chooses the light of each shadow ray: ``uniform_lights``, ``power_lights``, ``tree_lights``,
+         ``nvc_lights``. (Default: the scene's own choice, as in ``path``)
 """
 
 

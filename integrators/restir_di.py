@@ -105,8 +105,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
          elsewhere. (Default: everywhere)
      * - light_sampler
        - |emitter|
-       - Nested plugin that chooses the candidates: ``nvc_lights``, ``power_lights`` or ``uniform_lights``. (Default:
-         none, see ``candidates``)
+       - Nested plugin that chooses the candidates: ``nvc_lights``, ``tree_lights``, ``power_lights`` or
+         ``uniform_lights``. (Default: none, see ``candidates``)
      * - history
        - |float|
        - Confidence of what was kept in the frame before, in frames, at most; 0: no reuse over frames. (Default: 20)

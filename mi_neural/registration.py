@@ -7,7 +7,9 @@ made under one variant still works after a visit to another.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
 import importlib
 import importlib.util
 import sys
@@ -63,7 +65,9 @@ def register() -> None:
 
 
 def _own_line_last() -> None:
-    """Let the last line of an error inside of ``mi.render`` be the plugin's own.
+    """Let the last line of an error inside of ``mi.render`` be the plugin's own, and nothing be collected where it is
+    part of a function that the user freezes: memory freed in a recording ends the process. What is garbage by then is
+    left alone until the next image outside of one.
 
     Mitsuba hands every exception on as the cause of another, "drjit.custom(...): error while performing ...": the line
     that says what to do is added as a note (Python 3.11 and newer).
@@ -74,10 +78,19 @@ def _own_line_last() -> None:
     if hasattr(render, "own_line_last") or not hasattr(BaseException, "add_note"):
         return
 
+    from .render.frozen import is_recording, undisturbed
+
     @functools.wraps(render)
     def wrapped(*args, **keys):
+        recording = is_recording()
+        if recording:
+            gc.freeze()
+        elif wrapped.left_alone:
+            gc.unfreeze()
+        wrapped.left_alone = recording
         try:
-            return render(*args, **keys)
+            with undisturbed() if recording else contextlib.nullcontext():
+                return render(*args, **keys)
         except RuntimeError as e:
             cause = e
             while cause.__cause__ is not None:
@@ -86,7 +99,7 @@ def _own_line_last() -> None:
                 e.add_note(str(cause))
             raise
 
-    wrapped.own_line_last = True
+    wrapped.own_line_last, wrapped.left_alone = True, False
     for module in [m for n, m in sys.modules.items() if n.partition(".")[0] == "mitsuba"]:
         if vars(module).get("render") is render:
             module.render = wrapped

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from . import public
+
 __all__ = ["ANSWERS", "names", "path"]
 
 _FOLDER = Path(__file__).resolve().parent
@@ -13,7 +15,15 @@ def names() -> list[str]:
 
 
 def path(name: str) -> Path:
-    """The XML file of a shipped scene. Raises `ValueError`, listing the names, where there is none."""
+    """The XML file of a shipped scene, or of a public one that is on this machine (`mi-neural scenes`).
+
+    Raises `ValueError` where there is none: it lists the names, or says what to type to get the scene.
+    """
+    if name in public.names():
+        if not public.file(name).is_file():
+            raise ValueError(f"the public scene {name!r} is not in {public.folder()}: type "
+                             f"mi-neural scenes get {name.partition('/')[0]}")  # fmt: skip
+        return public.file(name).resolve()
     if name not in names():
         raise ValueError(f"no scene named {name!r}; the shipped scenes are: {', '.join(names())}")
     return _FOLDER / f"{name}.xml"

@@ -59,7 +59,8 @@ QUICK = {"train_frames": 32, "train_samples": 1024}
 #: Integrators as "TYPE KEY=VALUE ...", or "WRAPPER of TYPE ...".
 UNBIASED = (
     "plain_path", "plain_path max_depth=4 hide_emitters=true", "plain_path light_sampler=nvc_lights",
-    "plain_path light_sampler=power_lights", "moment of plain_path", "nirc cache_samples=0",
+    "plain_path light_sampler=power_lights", "plain_path light_sampler=tree_lights", "moment of plain_path",
+    "nirc cache_samples=0",
     "nrc spread_threshold=Infinity", "nirc_two_level", "nirc_two_level cache_samples=4 alpha=1.0",
     "nirc_two_level every_vertex=true cache_samples=4", "nirc_two_level ris=true cache_samples=4",
     "nirc_two_level cache_samples=4 channels=cache,residual", "nvc_direct", "restir_di",

@@ -64,6 +64,7 @@ ENTRANTS: dict[str, Entrant] = {
     "plain_path": Entrant({"type": "plain_path", **PATH}),
     "uniform_lights": Entrant(lit_by("uniform_lights")),
     "power_lights": Entrant(lit_by("power_lights")),
+    "tree_lights": Entrant(lit_by("tree_lights")),
     "nvc_lights": Entrant(lit_by("nvc_lights")),
     "nvc_direct": Entrant({"type": "nvc_direct", "max_depth": 2, **PATH}, depth=2),
     "restir_di": Entrant({"type": "restir_di", **PATH}, depth=2, resets=True),

@@ -6,6 +6,7 @@ import shlex
 
 import mitsuba as mi
 import pytest
+import typer
 from rich.console import Console
 from test_structure import plugin_class, table_rows
 from typer.testing import CliRunner
@@ -141,13 +142,17 @@ def test_commands_of_guides_and_readme_exist(root):
     texts = [pages.guide(name) for name in GUIDES] + [(root / "README.md").read_text(encoding="utf-8")]
     found = [words for text in texts for words in commands_in(text)]
     assert len(found) > 5
-    known = {command.name or command.callback.__name__: command for command in cli.app.registered_commands}
+    program = typer.main.get_command(cli.app)
     for words in found:
-        assert words[0] in known, f"mi-neural {' '.join(words)}"
+        command, names = program, []
+        while hasattr(command, "commands") and len(names) < len(words):  # a command, or one below it
+            assert words[len(names)] in command.commands, f"mi-neural {' '.join(words)}"
+            names.append(words[len(names)])
+            command = command.commands[names[-1]]
         options = [w for w in words[1:] if re.match(r"--?[a-zA-Z]", w)]
-        help_ = CliRunner().invoke(cli.app, [words[0], "--help"]).output
+        help_ = CliRunner().invoke(cli.app, [*names, "--help"]).output
         for option in options:
-            assert re.search(rf"(^|\s|,){re.escape(option)}\b", help_), f"mi-neural {words[0]} has no {option}"
+            assert re.search(rf"(^|\s|,){re.escape(option)}\b", help_), f"mi-neural {' '.join(names)} has no {option}"
 
 
 def test_modules_that_guides_and_readme_run_exist(root):

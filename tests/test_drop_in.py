@@ -5,6 +5,7 @@ for 8 % of bias: a false alarm in about 10,000 choices of seed.
 """
 
 import gc
+import re
 import resource
 import threading
 
@@ -227,7 +228,7 @@ def test_function_of_the_users_own_may_be_frozen_around_a_trained_integrator(nam
 
 
 @pytest.mark.parametrize("integrator", ["plain_path", "nirc"])
-@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "nvc_lights"])
+@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "tree_lights", "nvc_lights"])
 def test_light_sampler_inside_a_function_of_the_users_own_says_why_not(sampler, integrator, run_python):
     """A replay would choose among the lights of the first call; in a process of its own, as it ended the process."""
     out = run_python(f"""
@@ -247,6 +248,34 @@ except Exception as e:
     print(e)
 """).stdout
     assert f"{sampler}: inside a function frozen by dr.freeze" in out and "plain_path" in out
+
+
+def test_nothing_is_collected_inside_of_a_recording_of_the_users_own(run_python):
+    """Memory of an earlier image that is freed there ends the process. Here a collection is due at every allocation."""
+    out = run_python("""
+import mi_neural, mitsuba as mi, drjit as dr, gc, traceback
+mi.set_variant("llvm_ad_rgb")
+from mi_neural import scenes
+scene = mi.load_file(str(scenes.path("cornell_box")), resx=8, resy=8)
+it = mi.load_dict({"type": "plain_path"})
+mi.render(scene, integrator=it, spp=1)
+frame = dr.freeze(lambda scene, it, seed: mi.render(scene, integrator=it, spp=1, seed=seed))
+inside, outside = 0, 0
+
+def collects(phase, info):
+    global inside, outside
+    if phase == "start" and dr.flag(dr.JitFlag.FreezingScope):
+        within = any(f.name == "render" and "mitsuba" in f.filename for f in traceback.extract_stack())
+        inside, outside = inside + within, outside + (not within)
+
+gc.collect()
+gc.callbacks.append(collects)
+gc.set_threshold(1)
+frame(scene, it, mi.UInt32(0))
+gc.set_threshold(700)
+print(f"{inside} inside, {outside} outside")
+""").stdout
+    assert re.fullmatch(r"0 inside, [1-9]\d* outside\n", out), out
 
 
 def test_scenes_loaded_in_a_loop_leave_nothing_behind():

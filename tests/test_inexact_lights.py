@@ -179,7 +179,7 @@ def test_plans_have_a_light_sampler_where_mitsuba_is_not_exact():
     assert chosen(9, lambda: LightNoise(2.0, 1.9, 2.0)).value == "power_lights"
     assert chosen(9, lambda: LightNoise(2.0, 2.0, 0.01)).value == "nvc_lights"
     assert not chosen(2**20).modelled and "is not exact" in chosen(2**20).because
-    for name in ("uniform_lights", "power_lights", "nvc_lights"):
+    for name in ("uniform_lights", "power_lights", "tree_lights", "nvc_lights"):
         assert of_sampler(facts(1, **{"a mesh attribute": 1}), Request(name)).modelled("light_sampler")
         assert not of_sampler(facts(1), Request(name)).modelled("light_sampler")
 
@@ -208,7 +208,7 @@ def test_one_light_is_exact_in_integrators_that_plan(lit_by_bent_normals, type_)
     assert_same_mean(renders(scene, ours, 8, 64), reference, type_, blocks=2)
 
 
-@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "nvc_lights"])
+@pytest.mark.parametrize("sampler", ["uniform_lights", "power_lights", "tree_lights", "nvc_lights"])
 def test_one_light_is_exact_with_a_light_sampler(lit_by_bent_normals, sampler):
     scene, reference = lit_by_bent_normals
     nested = {"type": sampler, **({"train_frames": 1, "train_samples": 64} if sampler == "nvc_lights" else {})}

@@ -17,6 +17,7 @@ from mi_neural.lights.table import LightTable
 SAMPLERS = {
     "uniform": {"type": "uniform_lights"},
     "power": {"type": "power_lights"},
+    "tree": {"type": "tree_lights"},
     "trained": {"type": "nvc_lights", "train_frames": 30, "train_steps": 0, "train_samples": 1024},
     "untrained": {"type": "nvc_lights", "train_frames": 0, "train_steps": 0, "train_samples": 64},
     "unshadowed": {"type": "nvc_lights", "visibility": False},
@@ -90,11 +91,11 @@ def place(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind, name", [
-    *[("two", name) for name in ("power", "trained")],
-    *[("kinds", name) for name in ("uniform", "trained", "untrained", "clusters", "cells")],
-    *[("32", name) for name in ("trained", "clusters")],
-    *[("mesh", name) for name in ("power", "clusters")],
-    *[("spotted", name) for name in ("uniform", "trained")],
+    *[("two", name) for name in ("power", "tree", "trained")],
+    *[("kinds", name) for name in ("uniform", "tree", "trained", "untrained", "clusters", "cells")],
+    *[("32", name) for name in ("tree", "trained", "clusters")],
+    *[("mesh", name) for name in ("power", "tree", "clusters")],
+    *[("spotted", name) for name in ("uniform", "tree", "trained")],
     *[("envmap", name) for name in ("cells", "untrained cells")],
     ("constant", "cells"),
 ])  # fmt: skip
@@ -141,7 +142,7 @@ def test_neural_depth_with_clusters_is_refused_by_render(place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["trained", "clusters"])
+@pytest.mark.parametrize("name", ["tree", "trained", "clusters"])
 def test_image_of_longer_paths_is_that_of_path(place, name):
     scene, path = place("kinds", 4)
     assert_same_mean(renders(scene, path_with(name, 4), 16, 128), path, name, relative=1e-5)
@@ -229,7 +230,7 @@ def nirc(name, **keys):
     )
 
 
-@pytest.mark.parametrize("name, depth", [("power", 2), ("clusters", 2), ("trained", 4)])
+@pytest.mark.parametrize("name, depth", [("power", 2), ("tree", 4), ("clusters", 2), ("trained", 4)])
 def test_nirc_without_its_cache_is_path(place, name, depth):
     scene, path = place("kinds", depth)
     assert_same_mean(renders(scene, nirc(name, max_depth=depth), 16, 32), path, f"{name}, {depth}", relative=1e-5)
@@ -267,7 +268,7 @@ def test_light_that_turns_into_nan_harms_no_pixel_that_does_not_see_it():
     finite and lit by the others."""
     three = {**many("two", None), "c": {"type": "point", "position": [0, 1, 3], "intensity": 1.0}}
     scene = test_scene(three, 8)
-    integrators = [path_with(name) for name in ("power", "trained")]
+    integrators = [path_with(name) for name in ("power", "tree", "trained")]
     for integrator in integrators:
         integrator.render(scene, spp=4)
     params = mi.traverse(scene)
@@ -422,7 +423,7 @@ def test_another_scene_is_learned_anew_even_where_the_first_is_gone():
         del scene
 
 
-@pytest.mark.parametrize("name", ["clusters"])
+@pytest.mark.parametrize("name", ["tree", "clusters"])
 def test_image_after_a_change_is_that_of_a_fresh_integrator(name):
     """The pass is frozen: what it knows of lights must be recorded anew where it changes. The 24 triangles are grouped
     otherwise once they move, and a lamp gets a picture that it had not."""
@@ -498,7 +499,7 @@ def test_impossible_training_is_refused(key, value):
 
 
 def test_unknown_keys_are_refused():
-    for type_ in ("uniform_lights", "power_lights", "nvc_lights"):
+    for type_ in ("uniform_lights", "power_lights", "tree_lights", "nvc_lights"):
         with pytest.raises(RuntimeError, match="outputz"):
             mi.load_dict({"type": type_, "outputz": 3})
 
@@ -527,7 +528,7 @@ def test_a_light_sampler_gives_no_light_where_it_stands_among_emitters():
 
 
 def test_samplers_print_and_load_from_xml():
-    for name in ("uniform_lights", "power_lights", "nvc_lights"):
+    for name in ("uniform_lights", "power_lights", "tree_lights", "nvc_lights"):
         text = (
             f'<integrator version="3.0.0" type="plain_path"><emitter type="{name}" name="light_sampler"/></integrator>'
         )

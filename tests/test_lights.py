@@ -25,7 +25,7 @@ from light_scenes import (
 from mi_neural.lights import table as table_module
 from mi_neural.lights.clusters import make_groups
 from mi_neural.lights.entries import CYLINDER, DISK, OTHER, PARALLELOGRAM, POINT, SPHERE, TRIANGLE
-from mi_neural.lights.sampling import PowerLights, UniformLights, VisibleLights
+from mi_neural.lights.sampling import PowerLights, TreeLights, UniformLights, VisibleLights
 from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, SHADOW_EPSILON, LightTable
 from mi_neural.render import vertex
 
@@ -211,12 +211,13 @@ def test_odd_lights_give_finite_columns(tmp_path, rng, case):
     if case in ("black", "NaN"):
         assert (c["intensity"] == 0).all()
     groups = make_groups(table, 4, "kmeans")
-    for sampler in (UniformLights(table), PowerLights(table), VisibleLights(table, groups)):
+    for sampler in (UniformLights(table), PowerLights(table), TreeLights(table), VisibleLights(table, groups)):
         n = 256
-        choice = sampler.choose(place([0, 0, 0.5], n), mi.Vector3f(0, 0, 1), mi.Bool(False), uniforms(n).next_1d(),
-                                uniforms(n, 1), mi.UInt32(0), mi.Bool(True))  # fmt: skip
+        seen_from = place([0, 0, 0.5], n), mi.Vector3f(0, 0, 1), mi.Bool(False)
+        choice = sampler.choose(*seen_from, uniforms(n).next_1d(), uniforms(n, 1), mi.UInt32(0), mi.Bool(True))
+        pmf_hit = choice.of_hit(sampler, *seen_from, mi.UInt32(0), mi.Bool(True))
         assert (np.array(choice.index) < table.n_lights).all()
-        for value in (choice.weight, choice.pmf, choice.pmf_hit):
+        for value in (choice.weight, choice.pmf, pmf_hit):
             assert np.isfinite(np.array(value)).all() and (np.array(value) >= 0).all()
 
 

@@ -57,7 +57,7 @@ SCENES = {
                "volpath"),
 }  # fmt: skip
 SAMPLERS = {
-    "uniform": {"type": "uniform_lights"}, "power": {"type": "power_lights"},
+    "uniform": {"type": "uniform_lights"}, "power": {"type": "power_lights"}, "tree": {"type": "tree_lights"},
     "nvc": {"type": "nvc_lights", "train_frames": 8, "train_samples": 256},
     "clusters": {"type": "nvc_lights", "train_frames": 8, "train_samples": 256, "outputs": 2},
     "cells": {"type": "nvc_lights", "train_frames": 2, "train_samples": 256, "environment_cells": 4},
@@ -66,7 +66,8 @@ SAMPLERS = {
 CHOSEN = [("homogeneous", "uniform"), ("homogeneous", "power"), ("camera inside", "uniform"), ("camera inside", "nvc"),
           ("colours", "nvc"), ("things in it", "clusters"), ("sky", "cells"), ("heterogeneous", "nvc"),
           ("instances", "nvc"), ("half open shell", "nvc"),
-          ("half open shell", "power"), ("points", "unlearned")]  # fmt: skip
+          ("half open shell", "power"), ("points", "unlearned"), ("things in it", "tree"), ("points", "tree"),
+          ("sky", "tree"), ("half open shell", "tree")]  # fmt: skip
 VARIANTS = ("llvm_ad_mono", "llvm_ad_spectral")
 IN_VARIANTS = [("colours", "nvc"), ("coloured smoke", None), ("camera in colours", "uniform")]
 LIMITS = [{"max_depth": 1}, {"max_depth": 2}, {"max_depth": 3, "rr_depth": 1}, {"max_depth": -1, "rr_depth": 2},

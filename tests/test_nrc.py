@@ -160,7 +160,7 @@ def test_up_to_depth_two_it_is_path(mixed):
     assert integrator.cache.steps == 0
 
 
-@pytest.mark.parametrize("sampler", ["power_lights", pytest.param("uniform_lights", marks=SLOW)])
+@pytest.mark.parametrize("sampler", ["tree_lights", "power_lights", pytest.param("uniform_lights", marks=SLOW)])
 def test_nested_light_sampler_leaves_the_mean(mixed, sampler):
     """The lights are chosen otherwise, by the training paths too."""
     image = render(mixed, nrc(light_sampler={"type": sampler}), 64)

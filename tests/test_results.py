@@ -52,10 +52,16 @@ def test_a_missing_integrator_is_named(results, table):
         results.fill(table, {"groups": [GROUPS[0], GROUPS[2]], "environment": ENVIRONMENT}, "abc1234", None)
 
 
-def test_what_cannot_be_run_says_why(results, table, monkeypatch):
-    monkeypatch.delenv("SCENES", raising=False)
+def test_what_cannot_be_run_says_why(results, table, tmp_path, monkeypatch):
+    monkeypatch.setenv("MI_NEURAL_SCENES", str(tmp_path))
     assert results.not_run(table) == ""
-    assert "set SCENES" in results.not_run({**table, "command": "mi-neural compare $SCENES/a"})
+    named = {**table, "command": "mi-neural compare veach-ajar sponza-gray/sun sponza-gray/lights32 -o $OUT"}
+    assert "type mi-neural scenes get veach-ajar sponza-gray" in results.not_run(named)
+    for name in ("veach-ajar/scene", "sponza-gray/sun", "sponza-gray/lights32"):
+        file = tmp_path / f"{name}.xml"
+        file.parent.mkdir(exist_ok=True)
+        file.touch()
+    assert results.not_run(named) == ""
     assert "not kept" in results.not_run({**table, "command": None})
     assert "by hand" in results.not_run({k: v for k, v in table.items() if k != "extract"})
 

@@ -255,7 +255,9 @@ def test_the_plan_reads_materials_of_a_user(fails):
 # ---------------------------------------------------------------- lights
 
 
-SAMPLERS = {"uniform_lights": {}, "power_lights": {}, "nvc_lights": {"train_frames": 1, "train_samples": 16}}
+SAMPLERS = {
+    "uniform_lights": {}, "power_lights": {}, "tree_lights": {}, "nvc_lights": {"train_frames": 1, "train_samples": 16},
+}  # fmt: skip
 CAMERA = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
 
 

@@ -7,7 +7,7 @@ from expectation import assert_same_mean, renders
 
 SAMPLERS = {
     "none": {}, "uniform": {"light_sampler": {"type": "uniform_lights"}},
-    "power": {"light_sampler": {"type": "power_lights"}},
+    "power": {"light_sampler": {"type": "power_lights"}}, "tree": {"light_sampler": {"type": "tree_lights"}},
     "nvc": {"light_sampler": {"type": "nvc_lights", "train_frames": 8, "train_samples": 256}},
     "cells": {"light_sampler": {"type": "nvc_lights", "train_frames": 2, "train_samples": 256, "environment_cells": 4}},
 }  # fmt: skip

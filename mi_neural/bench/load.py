@@ -67,23 +67,33 @@ class LoadedScene:
 
 
 def find_scene(name: str) -> Path:
-    """The XML file for `name`: a file, or one of the shipped scenes. Unknown: an error that lists these."""
+    """The XML file for `name`: a file, one of the shipped scenes, or a public one that was got (`mi-neural scenes`).
+
+    Raises :class:`InputError` for others, with what to type.
+    """
     from mi_neural import scenes
+    from mi_neural.scenes import public
 
     path = Path(name).expanduser()
     if path.is_file():
         return path.resolve()
-    shipped = list(scenes.names())
-    if name in shipped:
-        return Path(scenes.path(name)).resolve()
+    shipped, of_others = list(scenes.names()), public.names()
+    if name in shipped or (name in of_others and public.file(name).is_file()):
+        return scenes.path(name).resolve()
     if path.is_dir():
         hint = next((str(p) for p in sorted(path.glob("*.xml"))), None)
         raise InputError(f"{name} is a folder, not a scene file" + (f": try {hint}" if hint else ""))
-    close = difflib.get_close_matches(name, shipped, 1)
+    if name in of_others:
+        raise InputError(f"the public scene {name} is not on this machine: type mi-neural scenes get "
+                         f"{name.partition('/')[0]}")  # fmt: skip
+    if name in public.SCENES:
+        raise InputError(f"{name} has several scene files: {', '.join(n for n in of_others if n.startswith(name))}")
+    close = difflib.get_close_matches(name, shipped + of_others, 1)
     raise InputError(
         f"no scene file {name!r}"
         + (f", did you mean {close[0]!r}?" if close else "")
         + (f"; shipped scenes: {', '.join(shipped)}" if shipped else "")
+        + f"; public ones: {', '.join(of_others)}"
     )
 
 

@@ -31,6 +31,9 @@ BESIDE, STEEPEST = 1e-3, 30.0
 #: What training lessens; the second is the seed's.
 LOSSES = ("cross_entropy", "squared")
 
+#: Levels of the hash grid.
+GRID = {"n_levels": 6, "base_resolution": 8, "per_level_scale": 1.7}
+
 
 @dataclass(frozen=True)
 class VisibilityTraining(Ramp):
@@ -40,6 +43,8 @@ class VisibilityTraining(Ramp):
           visibility of their lights; ``squared``: ``(V - t)²`` as published, beginning at about 1/2. Its gradient
           vanishes where the sigmoid is near 0 or 1: where each light is seen by few points all outputs fell to 0 within
           five steps, and stayed there
+    world_points  share of the points that lie anywhere in the box, the others lie on surfaces
+    vertices      these lie at the first so many vertices of paths from the camera, in turn
     """
 
     n_points: int = 2048
@@ -47,6 +52,8 @@ class VisibilityTraining(Ramp):
     first_rate: float = 0.05
     last_rate: float = 0.001
     loss: str = "cross_entropy"
+    world_points: float = 0.25
+    vertices: int = 3
 
     def __post_init__(self):
         super().__post_init__()
@@ -64,8 +71,8 @@ class VisibilityField(TrainedField):
         "averaged": object, "optimizer": object, "box_min": object, "box_inv_extent": object, "stride": object,
     }  # fmt: skip
 
-    def __init__(self, box_min, box_max, shape: FieldShape, seed: int = 0):
-        self.shape, self.seed = shape, seed
+    def __init__(self, box_min, box_max, shape: FieldShape, seed: int = 0, he: bool = False):
+        self.shape, self.seed, self.he = shape, seed, he
         box_min, box_max = np.asarray(box_min, np.float64), np.asarray(box_max, np.float64)
         self.box = (box_min.tolist(), box_max.tolist())
         self.box_min = mi.Point3f(box_min.tolist())
@@ -75,6 +82,9 @@ class VisibilityField(TrainedField):
     def reset(self) -> None:
         """The weights as they were when the field was made."""
         self.current, self.averaged = Weights(self.shape, self.seed), Weights(self.shape, self.seed)
+        if self.he:
+            for weights in (self.current, self.averaged):
+                _initialize_he(weights, self.seed)
         self.stride, self.steps = Stride.make(), 0
         self._attach_optimizer()
         dr.make_opaque(self.box_min, self.box_inv_extent)
@@ -124,21 +134,32 @@ class VisibilityField(TrainedField):
         return loss
 
 
+def _initialize_he(weights: Weights, seed: int) -> None:
+    """Normal weights of variance 2 / inputs, and no biases (He et al. 2015, eq. 10)."""
+    rng = np.random.default_rng(seed)
+    for name, tensor in list(weights.mlp.items()):
+        shape = tuple(tensor.shape)
+        new = rng.normal(0, np.sqrt(2 / shape[-1]), shape) if name.endswith("weights") else np.zeros(shape)
+        weights.mlp[name] = mi.TensorXf(new.astype(np.float32))
+    weights.pack()
+
+
 def _sigmoid(v):
     return dr.rcp(1 + dr.exp(-v))
 
 
-def training_points(scene, sensor, field: VisibilityField, lane, seed):
-    """One point for each entry of `lane`: a quarter uniform in the field's box, the others on surfaces, at the first,
-    second or third vertex of paths that start at the camera and bounce diffusely.
+def training_points(scene, sensor, field: VisibilityField, lane, seed, world_points: float = 0.25, vertices: int = 3):
+    """One point for each entry of `lane`: the share `world_points` uniform in the field's box, the others on surfaces,
+    at the first to last of so many `vertices` of paths that start at the camera and bounce diffusely.
 
     A path that leaves the scene stays at the vertex before; one that never met a surface gives a point in the box.
     """
     sampler = _numbers(lane, seed, index=lane, scramble=seed)
     in_box = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d()) / field.box_inv_extent + field.box_min
     ray, _ = sensor.sample_ray(sensor.shutter_open(), sampler.next_1d(), sampler.stratified_2d(0), sampler.next_2d())
-    n_bounces = lane % 4  # 0: in the box
-    on_surface = n_bounces > 0
+    boxed = mi.UInt32(mi.Float(lane) * world_points + 1)  # points in the box up to this one
+    on_surface = (lane > 0) & (boxed == mi.UInt32((mi.Float(lane) - 1) * world_points + 1)) | (world_points == 0)
+    n_bounces = dr.select(on_surface, 1 + (lane - (boxed if world_points > 0 else 0)) % vertices, 0)
 
     def bounce(k, ray, x, found, active, sampler):
         p, n, active = surface_point(scene, ray, active)
@@ -200,9 +221,12 @@ class VisibilityCache(Trainer):
         "seconds": "seconds_visibility",
     }  # fmt: skip
 
-    def __init__(self, training: VisibilityTraining | None = None, shape: FieldShape | None = None, seed: int = 0):
+    def __init__(
+        self, training: VisibilityTraining | None = None, shape: FieldShape | None = None, seed: int = 0,
+        grid: dict | None = None, he: bool = False,
+    ):  # fmt: skip
         super().__init__(training or VisibilityTraining(), seed)
-        self.shape = shape
+        self.shape, self.grid, self.he = shape, {**GRID, **(grid or {})}, he
         self.has_media = False  # in the scene of the field
 
     def start(self, scene, sensor, table, groups) -> None:
@@ -221,11 +245,11 @@ class VisibilityCache(Trainer):
             points = np.concatenate([np.array(q).T[np.array(v)] for q, v in ((p, valid), (p_next, valid_next))])
         low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
         shape = self.shape or FieldShape(
-            n_levels=6, n_features=4, hashmap_size=2**14, base_resolution=8, per_level_scale=1.7, direction_degree=-1,
-            width=32, n_hidden=2, n_outputs=groups.n_groups, leak=0.01,
+            **self.grid, n_features=4, hashmap_size=2**14, direction_degree=-1, width=32, n_hidden=2,
+            n_outputs=groups.n_groups, leak=0.01,
         )  # fmt: skip
         # Large cells: points in the air are few
-        self.field, self.ages = VisibilityField(low, high, shape, self.seed), Ages(low, high, resolution=2)
+        self.field, self.ages = VisibilityField(low, high, shape, self.seed, self.he), Ages(low, high, resolution=2)
 
     def _records(self, scene, sensor, table, groups, seeds):
         """Training points of some steps, one for each of `seeds`, and what they see: (points, step by step; 1 or 0 by
@@ -237,7 +261,10 @@ class VisibilityCache(Trainer):
         n, n_out = self.training.n_points, groups.n_groups
         with dr.suspend_grad():
             lane = dr.arange(mi.UInt32, n * dr.width(seeds))
-            x = training_points(scene, sensor, self.field, lane % n, dr.gather(mi.UInt32, seeds, lane // n))
+            x = training_points(
+                scene, sensor, self.field, lane % n, dr.gather(mi.UInt32, seeds, lane // n),
+                self.training.world_points, self.training.vertices,
+            )  # fmt: skip
             dr.eval(x)
             lane = dr.arange(mi.UInt32, n * n_out * dr.width(seeds))
             step, lane = lane // (n * n_out), lane % (n * n_out)

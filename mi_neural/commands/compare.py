@@ -20,7 +20,8 @@ DEFAULT_FRAME_SECONDS = "0.25,1"
 @options.readable
 def compare(
     scene: Annotated[
-        list[str] | None, typer.Argument(metavar="SCENE", help="Mitsuba XML files, or names of shipped scenes")
+        list[str] | None,
+        typer.Argument(metavar="SCENE", help="Mitsuba XML files, or names that mi-neural scenes lists"),
     ] = None,
     scenes: Annotated[
         Path | None, typer.Option(metavar="DIR", help="all scene files in a folder and below it, too")

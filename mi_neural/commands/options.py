@@ -12,7 +12,9 @@ import typer
 from mi_neural.bench import load, terminal
 from mi_neural.bench.load import InputError
 
-Scene = Annotated[str, typer.Argument(metavar="SCENE", help="a Mitsuba XML file, or the name of a shipped scene")]
+Scene = Annotated[
+    str, typer.Argument(metavar="SCENE", help="a Mitsuba XML file, or a name that mi-neural scenes lists")
+]
 Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="a key of the integrator; a.b=v reaches into a nested plugin"),

@@ -16,8 +16,9 @@ class Groups:
 
     As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in a Python list
     `kind`, and in arrays. `cell`: which groups are parts of the environment. `start`, `count`: its range in `member`,
-    the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity),
-    `cumulative` its running sum over `member`; `group_of` leads from light to group. `facts`: see the light table.
+    the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity, or
+    with `equal` the same for all), `cumulative` its running sum over `member`; `group_of` leads from light to group.
+    `facts`: see the light table.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -26,7 +27,7 @@ class Groups:
         "facts": object,
     }  # fmt: skip
 
-    def __init__(self, table: LightTable, label: np.ndarray, intensity: np.ndarray | None = None):
+    def __init__(self, table: LightTable, label: np.ndarray, intensity: np.ndarray | None = None, equal: bool = False):
         c = table.columns
         label = np.unique(label, return_inverse=True)[1].ravel()
         self.n_groups = int(label.max(initial=-1)) + 1
@@ -37,9 +38,8 @@ class Groups:
         intensity = np.maximum((c["intensity"] if intensity is None else intensity).astype(np.float64), 0)
         total = np.bincount(label, intensity, self.n_groups)
         # No light is left out: a tenth is shared equally, so that a dark mean hides no bright part
-        within = (
-            0.9 * intensity / np.where(total > 0, total, 1)[label] + np.where(total > 0, 0.1, 1)[label] / count[label]
-        )
+        share = np.where((total > 0) & (not equal), 0.1, 1)[label]
+        within = (1 - share) * intensity / np.where(total > 0, total, 1)[label] + share / count[label]
         cumulative = np.cumsum(within[order])
         cumulative -= (cumulative[start] - within[order][start])[label[order]]
         cumulative[start + count - 1] = 1.0
@@ -50,50 +50,17 @@ class Groups:
         within[order] = cumulative - before
         self.single = bool((count == 1).all())
 
-        weight = np.where(total[label] > 0, intensity, 1.0)
-
-        def mean(v):
-            sums = [np.bincount(label, weight * v[:, i], self.n_groups) for i in range(3)]
-            return np.stack(sums, -1) / np.bincount(label, weight, self.n_groups)[:, None]
-
-        centers = c["center"].astype(np.float64)
-        center = mean(centers)
+        b = bounds(c, label, self.n_groups, intensity)
         self.kind = [int(k) for k in c["kind"][order][start]]
         first_texel = table.sky.first if table.sky is not None else table.n_lights
         self.cell = [bool(i >= first_texel) for i in order[start]]
-        radius = np.zeros(self.n_groups)
-        np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
-        radius[[k != LOCAL for k in self.kind]] = 0
-        axis = mean(c["axis"].astype(np.float64))
-        length = np.linalg.norm(axis, axis=1)
-        axis = np.where(length[:, None] > 1e-6, axis / np.maximum(length, 1e-30)[:, None], [0, 0, 1])
-        angle = np.arccos(np.clip((c["axis"] * axis[label]).sum(axis=1), -1, 1)) + np.arccos(np.clip(c["cone"], -1, 1))
-        widest = np.zeros(self.n_groups)
-        np.maximum.at(widest, label, angle)
-        one = count == 1
-        radius[one] = c["radius"][order][start][one]
-        self.host = {"label": label, "count": count, "intensity": total, "center": center, "radius": radius}
-        cone = np.where(widest >= np.pi - 1e-3, -1.0, np.cos(widest + np.where(one, 0, 1e-4)))
-        # Lights at infinity: the angle about their mean direction
-        far = np.array([k == DIRECTION for k in self.kind])
-        length = np.linalg.norm(center, axis=1)
-        center[far] = np.where(length > 1e-6, center.T / np.maximum(length, 1e-30), [[0], [0], [1]]).T[far]
-        angle = np.arccos(np.clip((centers * center[label]).sum(axis=1), -1, 1)) + np.arccos(np.clip(c["cone"], -1, 1))
-        widest = np.zeros(self.n_groups)
-        np.maximum.at(widest, label, angle)
-        cone = np.where(far, np.cos(np.minimum(widest + np.where(one, 0, 1e-4), np.pi)), cone)
-        cone[[k == ENVIRONMENT for k in self.kind]] = -1
+        self.host = {"label": label, "count": count, "intensity": total, "center": b["center"], "radius": b["radius"]}
         vec = lambda v: own(mi.Vector3f(np.ascontiguousarray(v.T, np.float32)))  # noqa: E731
         big = np.finfo(np.float32).max
         flt = lambda v: own(mi.Float(np.ascontiguousarray(np.minimum(v, big), np.float32)))  # noqa: E731
         num = lambda v: own(mi.UInt32(np.ascontiguousarray(v, np.uint32)))  # noqa: E731
-        self.center, self.radius, self.axis, self.cone, self.intensity = (
-            vec(center),
-            flt(radius),
-            vec(axis),
-            flt(cone),
-            flt(total),
-        )
+        self.center, self.radius, self.axis = vec(b["center"]), flt(b["radius"]), vec(b["axis"])
+        self.cone, self.intensity = flt(b["cone"]), flt(total)
         self.start, self.count, self.member = num(start), num(count), num(order)
         self.within, self.cumulative, self.group_of = flt(within), flt(cumulative), num(label)
         self.search_steps = int(count.max(initial=1) - 1).bit_length()
@@ -116,6 +83,68 @@ class Groups:
         return light, dr.gather(mi.Float, self.within, light, active)
 
 
+def bounds(
+    c: dict[str, np.ndarray], label: np.ndarray, n: int, intensity: np.ndarray, boxes: bool = False
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Sets of lights, each as one light that gives at least what any of its members gives.
+
+    `c`: columns of the lights, `label` (lights,) the set of each, of `n` sets of which none is empty, `intensity`
+    (lights,) what they count. The spheres are centred where the light comes from in the mean or, with `boxes`, on the
+    middle of the set's box, which makes them smaller. Returns ``kind``, ``center``, ``radius``, ``axis``, ``cone``,
+    ``intensity`` of the sets as :func:`~mi_neural.lights.table.importance` reads them, float64. A set of several kinds
+    has the last of them.
+    """
+    count, total = np.bincount(label, minlength=n), np.bincount(label, intensity, n)
+    weight = np.where(total[label] > 0, intensity, 1.0)
+    one, some = count == 1, np.zeros(n, np.int64)
+    some[label] = np.arange(len(label))
+    kind = np.zeros(n, np.uint32)
+    np.maximum.at(kind, label, c["kind"])
+
+    def mean(v):
+        sums = [np.bincount(label, weight * v[:, i], n) for i in range(3)]
+        return np.stack(sums, -1) / np.bincount(label, weight, n)[:, None]
+
+    def widest(directions, middle):
+        angle = np.arccos(np.clip((directions * middle[label]).sum(axis=1), -1, 1))
+        out = np.zeros(n)
+        np.maximum.at(out, label, angle + np.arccos(np.clip(c["cone"], -1, 1)))
+        return out + np.where(one, 0, 1e-4)
+
+    def unit(v):
+        length = np.linalg.norm(v, axis=1)[:, None]
+        return np.where(length > 1e-6, v / np.maximum(length, 1e-30), [0, 0, 1])
+
+    centers, axes = c["center"].astype(np.float64), c["axis"].astype(np.float64)
+    center, axis = mean(centers), unit(mean(axes))
+    if boxes:
+        reach = c["radius"].astype(np.float64)[:, None]
+        low, high = extremes(centers - reach, centers + reach, label, n)
+        center = np.where(((kind == LOCAL) & ~one)[:, None], (low + high) / 2, center)
+    radius = np.zeros(n)
+    np.maximum.at(radius, label, np.linalg.norm(centers - center[label], axis=1) + c["radius"])
+    radius[one] = c["radius"][some][one]
+    radius[kind != LOCAL] = 0
+    angle = widest(axes, axis)
+    cone = np.where(angle >= np.pi - 1e-3, -1.0, np.cos(angle))
+    # Lights at infinity: the angle about their mean direction
+    far = kind == DIRECTION
+    center[far] = unit(center)[far]
+    cone = np.where(far, np.cos(np.minimum(widest(centers, center), np.pi)), cone)
+    cone[kind == ENVIRONMENT] = -1
+    return {"kind": kind, "center": center, "radius": radius, "axis": axis, "cone": cone, "intensity": total}
+
+
+def extremes(low: np.ndarray, high: np.ndarray, label: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least of `low` and most of `high` (members, 3) over each of `n` sets, (sets, 3) each; inf and -inf of sets
+    without a member."""
+    least, most = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
+    for i in range(3):
+        np.minimum.at(least[:, i], label, low[:, i])
+        np.maximum.at(most[:, i], label, high[:, i])
+    return least, most
+
+
 def morton(points: np.ndarray) -> np.ndarray:
     """Place on a space-filling curve (ten bits an axis) of `points` (n, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
@@ -127,18 +156,20 @@ def morton(points: np.ndarray) -> np.ndarray:
     return code
 
 
-def make_groups(table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0, n_cells: int = 32) -> Groups:
+def make_groups(
+    table: LightTable, n_outputs: int, method: str = "auto", seed: int = 0, n_cells: int = 32, equal: bool = False
+) -> Groups:  # fmt: skip
     """Groups of a table: each light alone if they are no more than `n_outputs`, else clusters.
 
     `method`: ``emitter`` (all triangles of an emitter together), ``kmeans``, or ``auto``: by emitter where they are
     few enough and small, else k-means. Lights at infinity are always alone. The texels of an
-    environment, if the table has them, make up to `n_cells` groups more.
+    environment, if the table has them, make up to `n_cells` groups more. `equal`: see :class:`Groups`.
     """
     lights = {k: v[: table.sky.first] for k, v in table.columns.items()} if table.sky is not None else table.columns
     label = _label_lights(lights, n_outputs, method, seed)
     if table.sky is not None:
         label = np.concatenate([label, label.max(initial=-1) + 1 + _label_texels(table.sky, n_cells, seed)])
-    return Groups(table, label)
+    return Groups(table, label, equal=equal)
 
 
 def _label_texels(sky, n_cells: int, seed: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How a light is chosen: one interface, three ways.
+"""How a light is chosen: one interface, four ways.
 
 ``choose(si, n, transmits, u, sampler, hit, active)`` draws a light for the surface point `si` with normal `n` (a mask
 says whether light from behind counts) by the uniform number `u`, and what more it needs from `sampler`, which comes
@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import tree
 from .clusters import Groups
 from .table import DIRECTION, ENVIRONMENT, LOCAL, LightTable, importance, own
 
@@ -34,19 +35,23 @@ class Choice:
     index    the light
     weight   what its contribution counts: 1 / pmf, or the weight of a resampled candidate, whose mean that is
     pmf      probability of the light, for MIS weights (with resampling: of it as a candidate)
-    pmf_hit  the same of the light `hit`
+    pmf_hit  the same of the light `hit`; None where it is `pmf` that finds it, for lanes that need it alone
     sampler  the sampler that was given, advanced by what was drawn; None where nothing was
     """
 
     index: mi.UInt32
     weight: mi.Float
     pmf: mi.Float
-    pmf_hit: mi.Float
+    pmf_hit: mi.Float | None
     sampler: object = None
 
     def advanced(self, sampler):
         """The sampler to go on with, `sampler` being the one that was given."""
         return sampler if self.sampler is None else self.sampler
+
+    def of_hit(self, lights, si, n, transmits, hit, active, **in_media):
+        """Probability of the light `hit`, with which `lights` made this choice; `active`: where it is needed."""
+        return lights.pmf(si, n, transmits, hit, active, **in_media) if self.pmf_hit is None else self.pmf_hit
 
 
 class UniformLights:
@@ -87,22 +92,99 @@ class PowerLights:
         return dr.gather(mi.Float, self.groups.within, index, active)
 
 
+class TreeLights:
+    """Lights by a walk down a light tree, each step in proportion to bounds on what the two children give the point
+    (Conty Estevez and Kulla 2018, section 5, without their adaptive splitting: one light is chosen).
+
+    The probability of a light is the product of its steps. It is found by the way back, from the leaf to the root. A
+    node's bound is 0 where none of its lights can reach the point, so what can reach it is never left out.
+    """
+
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "table": object, "spheres": object, "cones": object, "intensity": object, "kind": object, "left": object,
+        "parent": object, "light": object, "leaf": object, "facts": object,
+    }  # fmt: skip
+
+    def __init__(self, table: LightTable):
+        self.table = table
+        nodes = tree.build(table.columns)
+        flat = lambda *v: own(mi.Float(np.column_stack(v).astype(np.float32).ravel()))  # noqa: E731
+        whole = lambda v: own(mi.UInt32(v.astype(np.uint32)))  # noqa: E731
+        big = np.finfo(np.float32).max
+        self.spheres = flat(np.clip(nodes["center"], -big, big), np.minimum(nodes["radius"], big))
+        self.cones = flat(nodes["axis"], nodes["cone"])
+        self.intensity, self.kind = flat(nodes["intensity"]), whole(nodes["kind"])
+        self.left, self.parent, self.light = whole(nodes["left"]), whole(nodes["parent"]), whole(nodes["light"])
+        self.leaf = whole(nodes["leaf"])
+        kinds = sorted(set(table.columns["kind"].tolist()))
+        self.facts = (int(kinds[0]) if len(kinds) == 1 else None,)  # the kind of all lights
+        dr.eval(self)
+
+    def _weight(self, node, p, n, transmits, around, active):
+        """Unnormalised weight of a node for a surface at `p` with normal `n`, or for points in a medium."""
+        return importance(Node(self, node, active), p, n, transmits, around)
+
+    def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
+        # Each step takes bits of u for its own; once most are gone, a second number goes on
+        spare = sampler.next_1d()
+        node = mi.UInt32(0)
+        left = dr.gather(mi.UInt32, self.left, node, active)
+
+        def down(node, left, pmf, u, renewed):
+            a, b = (self._weight(left + k, si.p, n, transmits, around, active) for k in (0, 1))
+            total = a + b
+            share = a * dr.select(total > 0, dr.rcp(total), 0)
+            right = u >= share
+            taken = dr.select(right, b, a) * dr.select(total > 0, dr.rcp(total), 0)
+            u = dr.select(right, u - share, u) / dr.select(taken > 0, taken, 1)
+            pmf *= taken
+            renew = ~renewed & (pmf < 2**-12)
+            u = dr.clip(dr.select(renew, spare, u), 0, dr.one_minus_epsilon(mi.Float))
+            node = dr.select(right, left + 1, left)
+            left = dr.select(taken > 0, dr.gather(mi.UInt32, self.left, node, active), 0)
+            return node, left, pmf, u, renewed | renew
+
+        node, _, pmf, _, _ = dr.while_loop(
+            (node, left, mi.Float(1), mi.Float(u), mi.Bool(False)), lambda _, left, *__: active & (left > 0), down,
+            label="light tree, down",
+        )  # fmt: skip
+        index = dr.gather(mi.UInt32, self.light, node, active)
+        return Choice(index, dr.select(pmf > 0, dr.rcp(pmf), 0), pmf, None, sampler)
+
+    def pmf(self, si, n, transmits, index, active, around=None):
+        def up(node, pmf):
+            mine = self._weight(node, si.p, n, transmits, around, active)
+            other = self._weight(((node - 1) ^ 1) + 1, si.p, n, transmits, around, active)
+            total = mine + other
+            pmf *= mine * dr.select(total > 0, dr.rcp(total), 0)
+            return dr.gather(mi.UInt32, self.parent, node, active), pmf
+
+        leaf = dr.gather(mi.UInt32, self.leaf, index, active)
+        _, pmf = dr.while_loop(
+            (leaf, mi.Float(1)), lambda node, pmf: active & (node > 0) & (pmf > 0), up, label="light tree, up"
+        )
+        return pmf
+
+
 class VisibleLights:
     """Lights in proportion to what they would give the point without shadows, times their predicted visibility.
 
     All groups are looked at; where a group has several lights, one of `candidates` of them is resampled by what it
-    would give (RIS; Talbot et al. 2005). Without `field` visibility is taken to be 1.
+    would give (RIS; Talbot et al. 2005). Without `field` visibility is taken to be 1. Predictions count as at least
+    `floor`. With `visibility_alone` what groups of several lights would give does not count (the paper's choice).
     """
 
     DRJIT_STRUCT = {"table": object, "groups": object, "field": object, "n_candidates": object, "facts": object}  # noqa: RUF012
 
-    def __init__(self, table: LightTable, groups: Groups, field=None, candidates: int = 16):
+    def __init__(self, table: LightTable, groups: Groups, field=None, candidates: int = 16,
+                 floor: float = VISIBILITY_FLOOR, visibility_alone: bool = False):  # fmt: skip
         self.table, self.groups, self.field, self.candidates = table, groups, field, candidates
+        self.floor, self.several = floor, (groups.host["count"] > 1).tolist() if visibility_alone else None
         # Only what lies nearby differs within its group from point to point
         several = (groups.host["count"] > 1) & (np.array(groups.kind) == LOCAL)
         self.resamples = bool(several.any())
         self.n_candidates = own(mi.UInt32(np.where(several, candidates, 1).astype(np.uint32)))
-        self.facts = (candidates, self.resamples)
+        self.facts = (candidates, self.resamples, floor, visibility_alone)
 
     def weights(self, p, n, transmits, around=None) -> list:
         """Unnormalised weight of every group for a surface at `p` with normal `n`, or for points in a medium."""
@@ -110,8 +192,10 @@ class VisibleLights:
         visible = self.field.query(p) if self.field is not None else [mi.Float(1)] * g.n_groups
         weights = []
         for k, kind in enumerate(g.kind):
-            w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits, around)
-            weights.append(w * dr.fmax(visible[k], CELL_FLOOR if g.cell[k] else VISIBILITY_FLOOR))
+            w = mi.Float(1)
+            if self.several is None or not self.several[k]:
+                w = importance(Columns(g, mi.UInt32(k), kind), p, n, transmits, around)
+            weights.append(w * dr.fmax(visible[k], min(CELL_FLOOR, self.floor) if g.cell[k] else self.floor))
         return weights
 
     def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
@@ -177,4 +261,19 @@ class Columns:
             setattr(self, name, dr.gather(type_, getattr(columns, name), index, active))
 
 
-__all__ = ["DIRECTION", "ENVIRONMENT", "LOCAL", "Choice", "PowerLights", "UniformLights", "VisibleLights"]
+class Node:
+    """Columns of one node of a light tree per lane, as `importance` reads them."""
+
+    def __init__(self, lights: TreeLights, index, active):
+        (kind,) = lights.facts
+        self.kind = dr.gather(mi.UInt32, lights.kind, index, active) if kind is None else kind
+        sphere = dr.gather(mi.Vector4f, lights.spheres, index, active)
+        cone = dr.gather(mi.Vector4f, lights.cones, index, active)
+        self.center, self.radius = mi.Vector3f(sphere.x, sphere.y, sphere.z), sphere.w
+        self.axis, self.cone = mi.Vector3f(cone.x, cone.y, cone.z), cone.w
+        self.intensity = dr.gather(mi.Float, lights.intensity, index, active)
+
+
+__all__ = [
+    "DIRECTION", "ENVIRONMENT", "LOCAL", "Choice", "PowerLights", "TreeLights", "UniformLights", "VisibleLights",
+]  # fmt: skip

@@ -125,12 +125,9 @@ class Place:
     def seen_from(self):
         return self.origin
 
-    def receiver(self):
-        return self.received
-
     def pmf_hit(self, lights, choice, hit, active):
         if not self.media.partial:
-            return choice.pmf_hit
+            return choice.of_hit(lights, self.it, *self.received, hit, active, around=self.around)
         last = self.last
         return lights.pmf(self.origin, last.receiver, last.transmits, hit, active, around=last.around)
 

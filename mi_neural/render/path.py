@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -205,13 +206,14 @@ class Surface:
     def seen_from(self):
         return vertex.reference_point(self.it.p, self.it.n)
 
-    def receiver(self):
-        """See :func:`.vertex.receiver`."""
+    @cached_property
+    def received(self):
+        """How light is received here, see :func:`.vertex.receiver`."""
         return vertex.receiver(self.it, self.bsdf)
 
     def pmf_hit(self, lights, choice, hit, active):
-        """Probability that `lights` choose the light `hit`, which the path met."""
-        return choice.pmf_hit
+        """Probability that `lights`, which made this choice, choose the light `hit`, which the path met."""
+        return choice.of_hit(lights, self.it, *self.received, hit, active)
 
     def pdf(self):
         """Density of the direction in which the path went on."""
@@ -253,15 +255,16 @@ def direct_light(
     else:
         table = lights.table
         hit, emits = table.index_of(scene, found.si, found.followed)
-        n, transmits = here.receiver()
+        n, transmits = here.received
         in_media = {} if here.around is None else {"around": here.around}
         choice = lights.choose(here.it, n, transmits, numbers.light, sampler, hit, active, **in_media)
         sampler = choice.advanced(sampler)
         ds, light, pdf = table.sample(scene, here.it, choice.index, numbers.point, smooth & (choice.weight > 0))
         light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
-        pmf_hit = here.pmf_hit(lights, choice, hit, emits)
-        pdf_hit = pmf_hit * table.pdf(scene, here.origin, hit, found.si, ds_hit, emits & ~here.in_full)
+        weighed = emits & ~here.in_full
+        pmf_hit = here.pmf_hit(lights, choice, hit, weighed)
+        pdf_hit = pmf_hit * table.pdf(scene, here.origin, hit, found.si, ds_hit, weighed)
 
     # ------------------ Both techniques, weighted against each other -------------------------
     with dr.resume_grad(when=attached):
