@@ -7,7 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_neural import scenes
 from mi_neural.manual import pages
+from mi_neural.scenes import public
 
 CACHED = ("nirc", "nrc", "neural_path", "nirc_two_level")
 #: Examples that are not run, by a part of their text, and why.
@@ -34,6 +36,15 @@ def test_there_are_examples():
     assert {"quickstart", "cameras", "wrappers", "denoise", "lights", "gradients"} <= set(GUIDES)
 
 
+def _have_public_scenes(folder, monkeypatch):
+    """The examples name public scenes, which nothing fetches here: a shipped one stands for each."""
+    monkeypatch.setenv("MI_NEURAL_SCENES", str(folder))
+    for name in public.names():
+        file = public.file(name)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(scenes.path("cornell_box").read_bytes())
+
+
 @pytest.mark.parametrize("name", GUIDES)
 def test_examples_of_guides_run(name, tmp_path, monkeypatch):
     load_file, load_dict, range_ = mi.load_file, mi.load_dict, range
@@ -41,6 +52,7 @@ def test_examples_of_guides_run(name, tmp_path, monkeypatch):
     monkeypatch.setattr(mi, "load_file", lambda file, **keys: load_file(file, resx=16, resy=16, **keys))
     monkeypatch.setattr(mi, "load_dict", lambda keys, *args, **more: load_dict(shortened(keys), *args, **more))
     monkeypatch.setattr(mi, "set_variant", lambda name: None)
+    _have_public_scenes(tmp_path / "public", monkeypatch)
     if name == "denoise":
         pytest.importorskip("mitsuba_oidn", reason="the example denoises; type: pip install 'mi_neural[denoise]'")
     names = {"mi": mi, "dr": dr, "np": np, "range": lambda n: range_(min(n, 3))}
