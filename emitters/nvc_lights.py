@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from mi_neural.caches.visibility import LOSSES, VisibilityCache, VisibilityTraining
+from mi_neural.caches.visibility import GRID, LOSSES, VisibilityCache, VisibilityTraining
 from mi_neural.emitters.common import LightSampler
 from mi_neural.lights import clusters
 from mi_neural.lights.sampling import VISIBILITY_FLOOR, VisibleLights
@@ -15,17 +15,17 @@ class Constants:
     """What a preset decides; see the keys of the same names. `clustered`: what differs where lights are clustered."""
 
     train_frames: int = 32
-    train_samples: int = 2048
-    world_points: float = 0.25
-    vertices: int = 3
-    loss: str = "cross_entropy"
-    first_rate: float = 0.05
-    last_rate: float = 0.001
-    rate_steps: int = 200
-    averaging: float = 0.9
-    levels: int = 6
-    base_resolution: int = 8
-    level_scale: float = 1.7
+    train_samples: int = VisibilityTraining.n_points
+    world_points: float = VisibilityTraining.world_points
+    vertices: int = VisibilityTraining.vertices
+    loss: str = VisibilityTraining.loss
+    first_rate: float = VisibilityTraining.first_rate
+    last_rate: float = VisibilityTraining.last_rate
+    rate_steps: int = VisibilityTraining.ramp
+    averaging: float = VisibilityTraining.ema_decay
+    levels: int = GRID["n_levels"]
+    base_resolution: int = GRID["base_resolution"]
+    level_scale: float = GRID["per_level_scale"]
     init: str = "uniform"
     floor: float = VISIBILITY_FLOOR
     cluster_choice: str = "received"

@@ -110,7 +110,9 @@ class NIRCIntegrator(CacheIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
-        return 0.0 if not self.needs_cache else max(self.cache_samples, self.n_light)
+        if not self.needs_cache:
+            return 0.0
+        return 1.0 if self.termination == "balanced" else max(self.cache_samples, self.n_light)
 
     @property
     def n_light(self) -> int:
@@ -118,8 +120,9 @@ class NIRCIntegrator(CacheIntegrator):
         return self.light_samples if self.light_samples > 0 else self.state.measured.get("light_samples", 1)
 
     def measure_scene(self, scene, sensor) -> None:
-        """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene."""
-        if self.light_samples > 0:
+        """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene; a path that
+        stops by chance has one."""
+        if self.light_samples > 0 or self.termination == "balanced":
             return
         n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
@@ -345,7 +348,9 @@ NIRCIntegrator.__doc__ = (
          path stops with the probability t = Nc p_f / (Nc p_f + p_g), :math:`p_f = 1/\pi`, without a ray, and the cache
          is asked in the sampled direction (Dereviannykh et al.). ``balanced_shares``: a share of 1 - t, all rays
          being traced: less noise a sample, more time. ``adaptive``: none for one sample a pixel, growing with the
-         image's sample count, as noise gives way to bias. (Default: adaptive)
+         image's sample count, as noise gives way to bias. With ``balanced`` a camera sample has one light sample at
+         each vertex and one query, and the keys ``light_samples``, ``spread_threshold`` and ``gather_half`` say
+         nothing. (Default: adaptive)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is queried per camera sample. 0: no cache, ``nirc`` is a path tracer.

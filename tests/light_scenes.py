@@ -68,6 +68,13 @@ def random_triangles(rng, n, center=(0, 0, 3), spread=1.5, size=0.5) -> np.ndarr
     )
 
 
+def shining_triangles(path, rng, scale) -> tuple:
+    """64 random triangles about the origin, `scale` times their usual size, as lights of a scene: (corners, table)."""
+    corners = random_triangles(rng, 64, center=(0, 0, 0)) * scale
+    scene = mi.load_dict({"type": "scene", "m": {**triangles(path / "m.ply", corners), "emitter": glow()}})
+    return corners, LightTable(scene)
+
+
 def place(p, n=1):
     """A surface interaction at `p`, `n` lanes."""
     si = dr.zeros(mi.SurfaceInteraction3f, n)

@@ -15,6 +15,7 @@ from light_scenes import (
     random_triangles,
     row,
     scene_of,
+    shining_triangles,
     triangles,
     uniforms,
 )
@@ -222,10 +223,7 @@ def received(corners, normals, x, n, two_sided=False, steps=12) -> np.ndarray:
 @pytest.mark.parametrize("scale", [1e-4, 1, 1e5])
 def test_importance_is_positive_wherever_a_point_of_the_light_can_be_seen(tmp_path, rng, scale, two_sided):
     """Random triangles, near and far receivers, groups of 1 and of several; and no more than 4 times too small."""
-    corners = random_triangles(rng, 64, center=(0, 0, 0)) * scale
-    table = LightTable(
-        mi.load_dict({"type": "scene", "m": {**triangles(tmp_path / "m.ply", corners), "emitter": glow()}})
-    )
+    corners, table = shining_triangles(tmp_path, rng, scale)
     c = table.columns
     n = 400
     x = (rng.normal(size=(n, 3)) * rng.choice([0.5, 2, 20], (n, 1)) * scale).astype(np.float32)

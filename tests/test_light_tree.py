@@ -7,7 +7,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from expectation import assert_same_mean, renders
-from light_scenes import MIXED, at, glow, mixed_lights, place, random_triangles, row, scene_of, triangles, uniforms
+from light_scenes import (
+    MIXED,
+    at,
+    glow,
+    mixed_lights,
+    place,
+    random_triangles,
+    row,
+    scene_of,
+    shining_triangles,
+    triangles,
+    uniforms,
+)
 from test_light_choice import assert_frequencies, draws, pmf_of_all, received
 from test_vertex import lights, test_scene
 
@@ -151,10 +163,7 @@ def test_nodes_bound_their_lights(mixed, rng, tmp_path):
 @pytest.mark.parametrize("scale", [1e-4, 1, 1e5])
 def test_no_light_that_reaches_a_point_has_probability_zero(tmp_path, rng, scale, two_sided):
     """Every tenth point lies on a light: in the bounds of many nodes, and in the plane of a triangle."""
-    corners = random_triangles(rng, 64, center=(0, 0, 0)) * scale
-    table = LightTable(
-        mi.load_dict({"type": "scene", "m": {**triangles(tmp_path / "m.ply", corners), "emitter": glow()}})
-    )
+    corners, table = shining_triangles(tmp_path, rng, scale)
     n, lights_ = 400, TreeLights(table)
     x = (rng.normal(size=(n, 3)) * rng.choice([0.5, 2, 20], (n, 1)) * scale).astype(np.float32)
     x[::10] = corners[rng.integers(0, 64, n // 10)].mean(axis=1)

@@ -207,8 +207,11 @@ def test_balanced_paths_find_direct_light_as_path_does():
 
 def test_balanced_stops_and_saves_the_ray(sphere):
     """The more the cache counts, the fewer rays; nearly all paths stop at what the camera sees with many samples."""
-    depths = [render(sphere, nirc(termination="balanced", cache_samples=n, channels="depth"), 16)[..., -1].mean()
-              for n in (1, 8, 10**6)]  # fmt: skip
+    depths = []
+    for n in (1, 8, 10**6):
+        integrator = nirc(termination="balanced", cache_samples=n, channels="depth")
+        depths.append(render(sphere, integrator, 16)[..., -1].mean())
+        assert integrator.statistics()["queries"] == 16 * 16 * 16, "one query a camera sample"
     print(f"segments {depths}")
     assert depths[0] > 1.2 * depths[1] and abs(depths[2] - 1) < 1e-3
 

@@ -131,12 +131,12 @@ class Accuracy:
         dr.eval(self.sums, self.n_pairs, self.squares)
         noise, bias, n = self.sums
         inv_all = dr.select(self.n_pairs > 0, 1 / dr.maximum(self.n_pairs, 1e-3), 0)
-        noise_of_all = dr.sum(noise)
-        self.ratio = dr.select(noise_of_all > 0, dr.maximum(dr.sum(bias), 0) / dr.maximum(noise_of_all, 1e-20), 0)
+        noise_of_all, bias_of_all = dr.sum(noise), dr.sum(bias)
+        self.ratio = dr.select(noise_of_all > 0, dr.maximum(bias_of_all, 0) / dr.maximum(noise_of_all, 1e-20), 0)
         self.noise = (noise + PRIOR * noise_of_all * inv_all) / (n + PRIOR)
         variance = self.squares * inv_all
         # A squared bias counts at least as its mean's standard error: what is not known is not trusted
-        mean = dr.maximum(dr.sum(bias) * inv_all, dr.sqrt(variance * inv_all))
+        mean = dr.maximum(bias_of_all * inv_all, dr.sqrt(variance * inv_all))
         weight = dr.clip(variance / dr.maximum(dr.square(mean), 1e-20), PRIOR, 1e6)
         self.bias = dr.maximum((bias + weight * mean) / (n + weight), 0.1 * mean)
 
