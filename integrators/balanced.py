@@ -15,7 +15,7 @@ from mi_neural.render import vertex
 
 @dataclass
 class End:
-    """Where a path has stopped: at `position`, where the cache is asked for the light from `direction` (both in world
+    """Where a path has stopped: at `position`, where the cache is queried for the light from `direction` (both in world
     space), times the throughput `β`. A PyTree."""
 
     position: mi.Point3f
@@ -33,7 +33,8 @@ class Thinned(paths.Surface):
         self.keep = keep
 
     def pdf(self):
-        return super().pdf() * self.keep(super().pdf())
+        pdf = super().pdf()
+        return pdf * self.keep(pdf)
 
     def eval_pdf(self, d, active):
         f, pdf = super().eval_pdf(d, active)
@@ -51,12 +52,13 @@ def estimate(integrator, scene, lights, field, path, sampler):
     first = paths.stratified(sampler)
 
     def keep(pdf):
-        return 1 - spread.balanced_probability(n_cache, pdf)
+        return spread.follow_probability(n_cache, pdf)
 
     def direct(scene, lights, path, bsdf, found, numbers, sampler, alone=None):
         here = Thinned(path, bsdf, found, keep)
         L_nee, Le, sampler = paths.direct_light(scene, lights, path, bsdf, found, numbers, sampler, alone, here)
-        return L_nee, Le * dr.select(found.delta, 1, dr.rcp(dr.maximum(keep(found.bs.pdf), 1e-8))), sampler
+        share = dr.select(found.followed & ~found.delta, keep(found.bs.pdf), 1)  # not 0: the ray was followed
+        return L_nee, Le / share, sampler
 
     def step(path, end, direct_first, is_first, sampler):
         numbers, sampler = paths.draw_numbers(sampler)

@@ -263,7 +263,7 @@ class NIRCIntegrator(CacheIntegrator):
             needed |= ~spread.exceeds(width, a_0, self.spread_threshold)
         share = far
         if self.termination == "balanced_shares":
-            share = 1 - spread.balanced_probability(max(self.cache_samples, 1), pdf)
+            share = spread.follow_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)
 
     def gather(self, scene, lights, field, sampler, path, width, a_0, β_first):
@@ -346,7 +346,7 @@ NIRCIntegrator.__doc__ = (
        - Share of far light that is gathered. ``primary``: none, least noise, most bias. ``spread``: all, the path goes
          on until its spread exceeds that of the pixel (Müller et al. 2021, sec. 3.4). ``balanced``: at each vertex the
          path stops with the probability t = Nc p_f / (Nc p_f + p_g), :math:`p_f = 1/\pi`, without a ray, and the cache
-         is asked in the sampled direction (Dereviannykh et al.). ``balanced_shares``: a share of 1 - t, all rays
+         is queried in the sampled direction (Dereviannykh et al.). ``balanced_shares``: a share of 1 - t, all rays
          being traced: less noise a sample, more time. ``adaptive``: none for one sample a pixel, growing with the
          image's sample count, as noise gives way to bias. With ``balanced`` a camera sample has one light sample at
          each vertex and one query, and the keys ``light_samples``, ``spread_threshold`` and ``gather_half`` say

@@ -51,6 +51,21 @@ def mixed():
 
 
 @pytest.fixture(scope="module")
+def wrong_side():
+    """Two floors under a lamp; one is seen from behind, where its BSDF has no direction to give."""
+    T = mi.ScalarTransform4f
+    return mi.load_dict({
+        "type": "scene", "floor": {"type": "rectangle", "to_world": T().translate([-1, 0, 0])},
+        "turned": {"type": "rectangle", "to_world": T().translate([1, 0, 0]).rotate([1, 0, 0], 180),
+                   "bsdf": {"type": "roughplastic"}},
+        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": 3.0},
+                 "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180)},
+        "sensor": {"type": "perspective", "to_world": T().look_at([0, -3, 1], [0, 0, 0], [0, 0, 1]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}},
+    })  # fmt: skip
+
+
+@pytest.fixture(scope="module")
 def trained(sphere):
     """An integrator trained in the sphere, extra channels on. Leave its keys alone."""
     integrator = nirc(channels="direct, cache, residual")
@@ -203,6 +218,13 @@ def test_balanced_paths_find_direct_light_as_path_does():
     depth = render(scene, integrator, 32)[..., -1]
     print(f"segments: {depth[8].mean():.2f}")
     assert 1.05 < depth[8].mean() < 1.9
+
+
+def test_balanced_paths_survive_surfaces_that_give_no_direction(wrong_side):
+    """Density and weight are 0 there: no sample may be lost to 0/0."""
+    integrator = nirc(termination="balanced")
+    assert render(wrong_side, integrator, 16).mean() > 0
+    assert integrator.statistics()["nonfinite"] == 0
 
 
 def test_balanced_stops_and_saves_the_ray(sphere):

@@ -53,6 +53,15 @@ def test_balanced_probability_is_that_of_the_authors(n, at_lambert, rng):
     np.testing.assert_allclose(found, (n / np.pi) / (n / np.pi + pdf), rtol=1e-5)
 
 
+@pytest.mark.parametrize("n", [1, 4, 1000])
+def test_probability_to_follow_is_the_rest_and_exact_where_it_is_small(n, rng):
+    pdf = np.exp(rng.uniform(-30, 30, 1000)).astype(np.float32)
+    found = np.array(termination.follow_probability(n, mi.Float(pdf)), np.float64)
+    np.testing.assert_allclose(found, pdf / (n / np.pi + pdf.astype(np.float64)), rtol=1e-6)
+    np.testing.assert_allclose(found, 1 - np.array(termination.balanced_probability(n, mi.Float(pdf))), atol=2e-7)
+    np.testing.assert_array_equal(np.array(termination.follow_probability(n, mi.Float(0, np.inf))), [0, 1])
+
+
 def test_balanced_probability_goes_from_one_to_zero_as_lobes_sharpen():
     found = np.array(termination.balanced_probability(1, mi.Float(0, 1e-3, 1, 1e6, np.inf)))
     assert found[0] == 1 and found[-1] == 0 and (np.diff(found) < 0).all()

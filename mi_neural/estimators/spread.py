@@ -43,6 +43,11 @@ def balanced_probability(n_cache: int, pdf):
     return p_f / (p_f + pdf)
 
 
+def follow_probability(n_cache: int, pdf):
+    """``1 - t`` of :func:`balanced_probability`, without its cancellation where it is small."""
+    return dr.rcp(1 + n_cache * dr.inv_pi / pdf)
+
+
 @dataclass
 class PathSpread:
     """The spread of a path as it grows. A PyTree, for loops.
