@@ -75,7 +75,7 @@ def _own_line_last() -> None:
     import mitsuba.python.util as util
 
     render = util.render
-    if hasattr(render, "own_line_last") or not hasattr(BaseException, "add_note"):
+    if hasattr(render, "own_line_last"):
         return
 
     from .render.frozen import is_recording, undisturbed
@@ -95,7 +95,7 @@ def _own_line_last() -> None:
             cause = e
             while cause.__cause__ is not None:
                 cause = cause.__cause__
-            if cause is not e and str(cause).partition(":")[0] in _names():
+            if hasattr(e, "add_note") and cause is not e and str(cause).partition(":")[0] in _names():
                 e.add_note(str(cause))
             raise
 
