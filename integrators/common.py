@@ -92,7 +92,6 @@ class CacheIntegrator(FilmIntegrator):
     #: Numbers of a pixel while an image is made: colour, alpha, weight, and copies of them.
     PIXEL_BYTES = 4 * FILM_VALUES
     #: Training paths of a step where no key says it.
-    TRAIN_SAMPLES = Training.n_paths
     #: Where gradients come from if no key says it.
     GRADIENT = "cache"
     #: Whether the plan may choose a light sampler where none is nested.
@@ -115,7 +114,7 @@ class CacheIntegrator(FilmIntegrator):
         try:
             blend = props.get("blend", self.default_blend(props))
             training = Training(
-                n_paths=props.get("train_samples", self.TRAIN_SAMPLES),
+                n_paths=props.get("train_samples", self.default_paths()),
                 n_vertices=props.get("train_vertices", 8),
                 learning_rate=props.get("learning_rate", self.default_rate(blend)),
                 ema_decay=props.get("ema_decay", 0.99),
@@ -150,6 +149,10 @@ class CacheIntegrator(FilmIntegrator):
     def default_blend(self, props) -> str:
         """Which weights answer where no key says it."""
         return "ema"
+
+    def default_paths(self) -> int:
+        """Training paths a step where no key says it."""
+        return Training.n_paths
 
     def default_rate(self, blend: str) -> float:
         """The learning rate where no key says it."""

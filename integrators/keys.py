@@ -101,7 +101,7 @@ SHARED_KEYS = (
        - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
      * - train_samples
        - |int|
-       - Training paths per frame. (Default: 4096, ``nrc`` and ``neural_path`` 2048)
+       - Training paths per frame. (Default: 4096, ``nrc`` and ``neural_path`` 2048, on a GPU 8192)
      * - train_vertices
        - |int|
        - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)

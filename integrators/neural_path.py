@@ -11,6 +11,7 @@ from mi_neural.caches.outgoing import OutgoingShape
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix, vertex
+from mi_neural.render.kernels import end_kernel
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
 #: Queries a camera sample, at its first surface and at its end.
@@ -88,8 +89,10 @@ class NeuralPathIntegrator(OutgoingIntegrator):
 
         shows = bool({"cache", "density"} & set(self.channels))
         seen = (dr.max(end.β_first) > 0) & ((end.share > 0) | shows)
+        last = surface_of(path.si, path.si.bsdf(path.ray), end.ends, glossy)
+        end_kernel(path.L, path.β, path.valid, path.depth, end.ends, end.share, end.β_first, end.first, last)
         at_first = end.β_first * query(seen, end.first)
-        at_end = path.β * query(end.ends, surface_of(path.si, path.si.bsdf(path.ray), end.ends, glossy))
+        at_end = path.β * query(end.ends, last)
         cached = end.share * at_first + dr.select(end.ends, at_end, 0)
         channels |= {"cached": cached, "cache": at_first}
         if shows:

@@ -7,7 +7,8 @@ from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape
 from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
-from mi_neural.render import prefix, vertex
+from mi_neural.render import prefix
+from mi_neural.render.kernels import end_kernel
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
 
@@ -46,12 +47,13 @@ class NRCIntegrator(OutgoingIntegrator):
         end, sampler = prefix.trace(
             self, scene, lights, sampler, ray, active, stop if cached else None, glossy, looks
         )
-        path, cache = end.path, mi.Color3f(0)
+        path, cache, shown = end.path, mi.Color3f(0), sigma_channels(None, None, None)
         if cached:
             surface = surface_of(path.si, path.si.bsdf(path.ray), end.queried, glossy)
+            end_kernel(path.L, path.β, path.valid, path.depth, end.queried, surface, end.first, end.β_first)
             cache = dr.select(end.queried, path.β * field.query(*surface.inputs()), 0)
+            shown = sigma_channels(field, surface.position, surface.normal)
         channels = {"traced": path.L, "cached": cache, "depth": dr.select(path.valid, mi.Float(path.depth), 0)}
-        shown = sigma_channels(field if cached else None, path.si.p, vertex.facing(path.si))
         channels |= {k: dr.select(end.queried, v, 0) for k, v in shown.items()}
         channels |= {"cache": mi.Color3f(0), "density": mi.Float(0)}
         if looks:

@@ -44,7 +44,6 @@ class OutgoingIntegrator(CacheIntegrator):
     """Base of the integrators that train a cache of outgoing radiance."""
 
     CHOOSES_LIGHTS = True
-    TRAIN_SAMPLES = OutgoingTraining.n_paths
     content = "reflected"
 
     def __init__(self, props):
@@ -77,6 +76,9 @@ class OutgoingIntegrator(CacheIntegrator):
             for name, key in KEYS.items():
                 message = message.replace(f"{name} is", f"{key} is")
             raise ValueError(f"{self.plugin}: {message}") from None
+
+    def default_paths(self) -> int:
+        return OutgoingTraining.usual_paths()
 
     def default_rate(self, blend: str) -> float:
         return OutgoingTraining.learning_rate if blend == "ema" else super().default_rate(blend)

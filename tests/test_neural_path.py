@@ -21,6 +21,7 @@ from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
 from mi_neural.integrators.neural_path import DENOISED_SAMPLES, FULL, denoised_threshold
+from mi_neural.render.kernels import on_gpu
 
 SLOW = pytest.mark.slow
 #: Caches that are trained in a second.
@@ -245,7 +246,7 @@ def test_cache_at_the_first_surface_is_nrc_with_threshold_zero(trained, box, tmp
     force(integrator, bias=0.0)
     image = render(box, integrator, 4)
     known = render(box, outgoing_alone(trained, box, spread_threshold=0.0), 4)
-    np.testing.assert_allclose(image[..., :3], known, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(image[..., :3], known, rtol=1e-4, atol=1e-4 if on_gpu() else 1e-6)
     assert image[..., 4].max() == 1, "no path was traced"
 
 

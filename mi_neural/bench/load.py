@@ -122,6 +122,9 @@ def load_scene(
     path = find_scene(name)
     parameters = {k: str(v) for k, v in (parameters or {}).items()}
     config = mi.parser.ParserConfig(mi.variant())
+    # Threads would number the scene's parts in another order each time, and no kernel of the last process would fit:
+    # with OptiX ten seconds. What takes long, hierarchies and large files, is no slower
+    config.parallel = False
 
     def parse():
         state = mi.parser.parse_file(config, str(path), **parameters)

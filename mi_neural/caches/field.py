@@ -10,6 +10,7 @@ import drjit.nn as nn
 import mitsuba as mi
 import numpy as np
 
+from ..render.kernels import on_gpu
 from . import backprop, encoding, files
 from .files import FILE_VERSION, CacheFileError
 from .hash_grid import HashGrid
@@ -122,8 +123,8 @@ class Weights:
         network = nn.Sequential(*layers())
         self.mlp = network.alloc(mi.TensorXf, shape.n_inputs, rng=dr.rng(seed=2 * seed + 1))
 
-        # The one place where back ends differ: OptiX multiplies cooperative vectors in half precision, LLVM in single
-        self.half = dr.backend_v(mi.Float) == dr.JitBackend.CUDA if half is None else half
+        # OptiX multiplies cooperative vectors in half precision, LLVM in single
+        self.half = on_gpu() if half is None else half
         storage = mi.TensorXf16 if self.half else mi.TensorXf
         # Packed, the first layer has two parts, for the inputs that are known once per point and for the others
         self.n_first, n_others = shape.n_first, shape.n_inputs - shape.n_first

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..render.kernels import on_gpu
 from ..render.sampling import PathSampler
 from ..render.surface import scene_is_glossy, surface_of
 from . import encoding, loss
@@ -39,6 +40,8 @@ TARGET_MAX = 1e4
 EPSILON = 1e-2
 #: The learning rate of this network over that of the incident cache, trained on the same paths (manual, measured)
 RATE = 6.0
+#: Training paths on a GPU over those on a CPU.
+GPU_PATHS = 4
 #: Bins of the roughness, encoded as 1 - e^-roughness.
 ROUGHNESS_BINS = 4
 #: What the network can be told of a surface beside its position.
@@ -351,6 +354,12 @@ class OutgoingTraining(Training):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in [0, 1]")
         if not self.threshold >= 0:
             raise ValueError(f"threshold is {self.threshold}; it must be 0 or more")
+
+    @classmethod
+    def usual_paths(cls) -> int:
+        """`n_paths` where none were chosen. A GPU has room for `GPU_PATHS` times as many in hardly more time (manual,
+        speed)."""
+        return cls.n_paths * (GPU_PATHS if on_gpu() else 1)
 
     @classmethod
     def like(cls, shared: Training, **chosen) -> OutgoingTraining:

@@ -15,6 +15,7 @@ from ..estimators.spread import PathSpread
 from ..render import path as paths
 from ..render import vertex
 from ..render.film import film_rays
+from ..render.kernels import end_kernel
 from ..render.sampling import PathSampler
 from ..render.surface import Roughened, surface_of
 from .records import OutgoingRecords, TrainingRecords, empty_surfaces, leave_out_nonfinite
@@ -227,6 +228,7 @@ class _Tracer:
             found, sampler = self.bounce(path, n_rough, sampler)
             end += dr.select(queries, path.β * found.direct, 0)
         if query is not None:
+            end_kernel(end, path, queries, sampler)
             value, sampler = query(path.si, path.si.bsdf(path.ray), queries, sampler)
             end += dr.select(queries, path.β * value, 0)
         return end
@@ -276,6 +278,7 @@ def trace_training_paths(
 
     tracer = _Tracer(scene, lights, plan, glossy)
     vertices, n_vertices, path, n_rough, open_, sampler = tracer.walk(path, spread, sampler)
+    end_kernel(vertices, n_vertices, path, n_rough, open_, sampler)
     end = tracer.ends(path, n_rough, open_, query, sampler)
     dr.eval(vertices, end, n_vertices)
     arrived = _back_to_front(plan, vertices, n_vertices, end)

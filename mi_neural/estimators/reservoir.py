@@ -108,10 +108,11 @@ def balance(M_a, target_a, M_b, target_b):
     """Share of a in M_a target_a + M_b target_b; 0 where a gives nothing (balance heuristic with confidences, Lin et
     al. 2022). ``balance(a, b) + balance(b, a) = 1`` where either product is positive.
 
-    Ratios are taken before they are multiplied, so that targets of 1e30 pass.
+    Ratios are taken before they are multiplied, so that targets of 1e30 pass; below 1e-38 they count as 0, as a GPU
+    divides by them.
     """
     a, b = (
-        (M > 0) & (target > 0) & dr.isfinite(M) & dr.isfinite(target)
+        (M > 0) & (target >= dr.smallest(mi.Float)) & dr.isfinite(M) & dr.isfinite(target)
         for M, target in ((M_a, target_a), (M_b, target_b))
     )
     ratio = (M_b / dr.select(a, M_a, 1)) * (target_b / dr.select(a, target_a, 1))
