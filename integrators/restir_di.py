@@ -20,6 +20,7 @@ from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import Area, camera_rays, coverage, recordable
 from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, is_recording, undisturbed
+from mi_neural.render.kernels import on_gpu
 from mi_neural.render.sampling import PathSampler
 
 COMBINATIONS = ("unbiased", "biased")
@@ -276,6 +277,10 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             known = s.power.table.columns if s.power is not None else {}
             same = known and all(np.array_equal(v, known[k]) for k, v in table.columns.items())
             lights = s.power if same else PowerLights(table)
+        mixed = scene.environment() is not None and lights.table.n_emitters > 1
+        # On an H100, Dr.Jit 1.5.0 ended the process: jit_var(r0): unknown variable
+        self._check(not (mixed and on_gpu()), "on a GPU it renders no environment map together with other lights; take "
+                    "nvc_direct, or mi.set_variant('llvm_ad_rgb')")  # fmt: skip
         if s.power is None or s.power.table is not lights.table:
             s.power = lights if isinstance(lights, PowerLights) else PowerLights(lights.table)
         facts = (type(lights).__name__, _facts(lights.table), getattr(lights, "candidates", None))

@@ -118,7 +118,7 @@ def main() -> None:
     width, height = (int(n) for n in args.size.split("x"))
     for name in args.scenes:
         file = Path(name) if Path(name).suffix == ".xml" else scenes.path(name)
-        scene, reference = mi.load_file(str(file), resx=width, resy=height), None
+        scene, reference = mi.load_file(str(file), resx=width, resy=height, parallel=False), None
         label = file.parent.name if file.stem == "scene" else file.stem
         for integrator, keys in INTEGRATORS.items():
             row = {"scene": f"{label} {args.size}", "integrator": integrator}
