@@ -476,5 +476,6 @@ class CacheIntegrator(FilmIntegrator):
         self.state.image_open = self.film_state.planned_spp is not None
 
     def _render(self, scene, sensor, seed, spp: int):
+        block = super()._render(scene, sensor, seed, spp)
         self.state.queries += self.queries_per_sample * Area.of(sensor).n_pixels * spp
-        return super()._render(scene, sensor, seed, spp)
+        return block

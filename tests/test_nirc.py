@@ -191,12 +191,15 @@ def test_hidden_emitters_are_looked_through_as_path_does(type_):
     assert_same_mean(ours, path, type_, relative=1e-5)
 
 
-def test_share_of_gathered_light_follows_termination_and_samples():
-    assert [nirc(termination=t).settings(16)[0] for t in ("primary", "spread", "balanced")] == [0, 1, 0]
-    shares = [nirc(termination="adaptive", gather_half=8.0).settings(n)[0] for n in (1, 2, 9, 1000, 10**6)]
-    assert shares == sorted(shares) and 0 <= shares[0] < 0.2 and shares[-1] > 0.99
-    for n in (1, 2, 16):
-        assert 0 <= nirc(gather_half=0.0).settings(n)[0] <= 1
+def test_adaptive_takes_paths_that_stop_later_the_more_samples_there_are():
+    integrator, found = nirc(termination="adaptive"), []
+    for n in (1, 2, 9, 1000, 10**6):
+        found.append((*integrator.settings(n), integrator.one_path))
+    assert found[0] == (0.01, False) and all(one_path for _, one_path in found[1:])
+    thresholds = [c for c, _ in found[1:]]
+    assert thresholds[:2] == [1, 1] and thresholds == sorted(thresholds) and thresholds[-1] > 1000
+    assert nirc(spread_threshold=0.5).settings(1) == (0.5,) and nirc(spread_threshold=4.0).settings(2) == (4.0,)
+    assert not any(nirc(termination=t).one_path for t in ("primary", "spread", "balanced_shares"))
 
 
 def test_balanced_paths_find_direct_light_as_path_does():
@@ -316,15 +319,18 @@ def test_emission_that_turns_into_nan_is_counted_and_stays_out_of_the_image():
 # ---------------------------------------------------------------- channels
 
 
-def test_channels_sum_to_the_image(sphere, trained):
-    image = render(sphere, trained)
+@pytest.mark.parametrize("spp, by_cache", [(1, 0.5), (16, 0.25)])
+def test_channels_sum_to_the_image(sphere, trained, spp, by_cache):
+    """Paths of several samples a pixel stop at the second vertex, where half of the light has gone."""
+    image = render(sphere, trained, spp)
     assert image.shape == (16, 16, 12) and trained.aov_names() == [
         f"{n}.{c}" for n in ("direct", "cache", "residual") for c in "RGB"
     ]
     colour, direct, cache, residual = np.split(image, 4, axis=-1)
     np.testing.assert_allclose(direct + cache + residual, colour, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(direct, 0.5, rtol=1e-3)  # direct light of the point is exactly half of all
-    assert cache.mean() == pytest.approx(0.5, rel=0.05)
+    assert cache.mean() == pytest.approx(by_cache, rel=0.05)
+    assert (cache + residual).mean() == pytest.approx(0.5, rel=0.05)
 
 
 def test_channels_have_the_order_of_the_key(sphere, trained):
@@ -590,7 +596,7 @@ def test_each_sensor_of_a_scene_shows_its_own_view(mixed):
 @pytest.mark.parametrize("key, value", [
     ("max_depth", -2), ("rr_depth", 0), ("train_frames", -2), ("train_steps", -1), ("seed", -1), ("learning_rate", 0.0),
     ("learning_rate", -1.0), ("ema_decay", 1.5), ("ema_decay", -0.5), ("cache_samples", -1), ("light_samples", 0),
-    ("spread_threshold", -1.0), ("gather_half", -1.0), ("train_samples", 0), ("train_vertices", 1), ("levels", 0),
+    ("spread_threshold", -1.0), ("train_samples", 0), ("train_vertices", 1), ("levels", 0),
     ("hashmap_size", 33), ("width", 0), ("hidden_layers", 0), ("termination", "never"), ("channels", "direct,depht"),
 ])  # fmt: skip
 def test_impossible_key_is_refused_by_name(key, value):

@@ -1,0 +1,128 @@
+"""Paths that stop in a cache of incident radiance, without a ray in the direction that is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_neural.caches.blend import sigma_channels
+from mi_neural.estimators import spread
+from mi_neural.estimators.spread import SHARP_PDF, PathSpread
+from mi_neural.render import path as paths
+from mi_neural.render import vertex
+from mi_neural.render.kernels import end_kernel
+
+
+@dataclass
+class End:
+    """Where a path has stopped: at `position`, where the cache is queried for the light from `direction` (both in world
+    space), times the throughput `β`. A PyTree."""
+
+    position: mi.Point3f
+    normal: mi.Vector3f
+    direction: mi.Vector3f
+    β: mi.Color3f
+    queried: mi.Bool
+
+
+class ByChance:
+    """A path stops at each vertex with the probability t = Nc p_f / (Nc p_f + p_g), p_g being the density of its BSDF
+    sample: the balanced heuristic (Dereviannykh et al. 2025)."""
+
+    def __init__(self, n_cache: int):
+        self.n_cache = max(n_cache, 1)
+
+    def keep(self, pdf, wide):
+        """Probability with which a ray of density `pdf` is followed."""
+        return spread.follow_probability(self.n_cache, pdf)
+
+    def wide(self, path, spread):
+        """What else that depends on."""
+        return mi.Bool(False)
+
+
+class WhereWide:
+    """A path stops at the first vertex where its spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4); sharp lobes are
+    followed."""
+
+    def __init__(self, threshold):
+        self.threshold = threshold
+
+    def keep(self, pdf, wide):
+        return dr.select(wide & (pdf <= SHARP_PDF), 0, mi.Float(1))
+
+    def wide(self, path, spread):
+        return vertex.is_terminal(path.si, path.active) & spread.exceeds(self.threshold)
+
+
+class Thinned(paths.Surface):
+    """A surface whose BSDF rays are followed with the probability ``keep(pdf)``: their density is so much less."""
+
+    def __init__(self, path, bsdf, found, keep):
+        super().__init__(path, bsdf, found)
+        self.keep = keep
+
+    def pdf(self):
+        pdf = super().pdf()
+        return pdf * self.keep(pdf)
+
+    def eval_pdf(self, d, active):
+        f, pdf = super().eval_pdf(d, active)
+        return f, pdf * self.keep(pdf)
+
+
+def estimate(integrator, scene, lights, field, path, sampler, rule):
+    """A path that stops as the `rule` says, by what an integrator's `estimate` returns; `path` is at its first surface.
+
+    Mirror lobes are always followed. Where the path stops no ray is traced, and the cache answers for the direction of
+    the BSDF sample. Direct light is estimated at each vertex. Its BSDF rays have the density p_g keep(p_g).
+    """
+    first = paths.stratified(sampler)
+
+    def step(path, end, spread, direct_first, is_first, sampler):
+        numbers, sampler = paths.draw_numbers(sampler)
+        numbers = dr.select(is_first, first, numbers)
+        wide = rule.wide(path, spread)
+
+        def keep(pdf):
+            return rule.keep(pdf, wide)
+
+        def direct(scene, lights, path, bsdf, found, numbers, sampler, alone=None):
+            here = Thinned(path, bsdf, found, keep)
+            L_nee, Le, sampler = paths.direct_light(scene, lights, path, bsdf, found, numbers, sampler, alone, here)
+            share = dr.select(found.followed & ~found.delta, keep(found.bs.pdf), 1)  # not 0: the ray was followed
+            return L_nee, Le / share, sampler
+
+        bsdf = path.si.bsdf(path.ray)
+        sampled = paths.sample_bsdf(path.si, bsdf, numbers.lobe, numbers.direction, path.active)
+        bs, weight, delta = sampled
+        stops = path.active & ~delta & (dr.max(weight) > 0) & (sampler.next_1d() >= keep(bs.pdf))
+        found, sampler = paths.bounce(
+            scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled,
+            follow=lambda bs, delta: ~stops, direct=direct,
+        )  # fmt: skip
+        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops)
+        end = dr.select(stops, here, end)
+        direct_first = dr.select(is_first, path.β * found.direct, direct_first)
+        path, sampler = paths.roulette(paths.advance(path, found, integrator.depth_limit), sampler, integrator.rr_depth)
+        smooth = vertex.is_terminal(path.si, path.active)
+        spread = spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, smooth)
+        return path, end, spread, direct_first, mi.Bool(False), sampler
+
+    n = dr.width(path.si.t)
+    a_0 = spread.camera_spread(dr.square(path.length), dr.dot(path.si.n, path.ray.d))
+    grown = PathSpread(dr.zeros(mi.Float, n), a_0, mi.Float(path.length), mi.Bool(path.active))
+    seen = path.L
+    path, end, _, direct_first, _, sampler = dr.while_loop(
+        (path, dr.zeros(End, n), grown, mi.Color3f(0), mi.Bool(True), sampler), lambda path, *_: path.active, step,
+        label="paths that stop",
+    )  # fmt: skip
+    end_kernel(path.L, path.valid, path.depth, end, direct_first, seen)
+    features = field.encode(end.position, end.normal)
+    cache = dr.select(end.queried, end.β * field.query(features, end.direction), 0)
+    channels = {"direct": direct_first, "cache": cache, "residual": path.L - seen - direct_first}
+    channels |= {"depth": path.depth - dr.select(end.queried, 1.0, 0.0)}  # no ray where it stopped
+    channels |= {k: dr.select(end.queried, v, 0) for k, v in sigma_channels(field, end.position, end.normal).items()}
+    return path.L + cache, dr.select(path.valid, mi.Float(1), 0), channels
