@@ -1,5 +1,5 @@
-"""One self-contained HTML page of a comparison. Each scene opens with what is seen at once: pictures side by side,
-which are zoomed together, and one plot of the error over time. Tables and more curves follow.
+"""One self-contained HTML page of a comparison. Each scene begins with pictures side by side, which are zoomed
+together, and one plot of the error over time. Tables and more curves follow.
 
 The page holds everything: pictures as data URLs, curves as inline SVG, style and script inline. It loads nothing.
 """

@@ -1,4 +1,4 @@
-"""Dynamic scenes: parameters that change from frame to frame, and what each frame is then worth.
+"""Dynamic scenes: parameters that change from frame to frame, and the error of each frame.
 
 :class:`Sequence` sets a scene to the state of a frame; :class:`References` holds one reference for each state;
 :class:`Run` renders the frames of one integrator after another, measures them, and goes on where it was interrupted.
@@ -32,7 +32,7 @@ from .load import InputError, LoadedScene
 
 #: Stream of random numbers of the frames; those below it belong to :mod:`budget`.
 STREAM_FRAMES = 16
-#: Frames of training between two looks at whether to save.
+#: Training frames between two checks whether to save.
 PRETRAIN_PART = 64
 #: Share of the time that saving a cache may take.
 KEEP_SHARE = 0.05
@@ -47,7 +47,8 @@ class Sequence:
     functions  key -> function(frame, original value) -> new value of the same shape; see :mod:`changes` for keys and
                shapes. A function must give the same for the same frame every time
     frames     their number
-    change_at  frame of an abrupt change, where figures are told apart by it; default: the first frame unlike frame 0
+    change_at  frame of an abrupt change, before and after which figures are separate; default: the first frame unlike
+               frame 0
 
     All functions are called for all frames here, so that what is wrong is found before the first image: raises
     :class:`InputError` for an unknown key, a function that fails or gives NaN or another shape (and says at which
@@ -86,12 +87,13 @@ class Sequence:
                     values[parameter.key] = value
             self.states.append(changes.digest(values))
 
-        self._current = ["unset"] * n  # so that all are set once, and no later frame differs from frame 0 in kind
+        self._current = ["unset"] * n  # so that all are set once, and later frames run the same kernels as frame 0
         self.restore()
 
     @property
     def change(self) -> int | None:
-        """The frame that divides before from after: `change_at`, or the first frame unlike frame 0; None: none is."""
+        """The frame that divides before from after: `change_at`, or the first frame unlike frame 0; None where there is
+        none."""
         if self.change_at is not None:
             return self.change_at
         return next((k for k, state in enumerate(self.states) if state != self.states[0]), None)
@@ -308,7 +310,7 @@ class Run:
             sizes = sorted(set(budget.plan_passes(scene, self.plan.spp)))
             case.seconds_compile = budget.warm_up(scene, integrator, sizes, self.plan.seed)
         elif hasattr(integrator, "train"):
-            integrator.train(scene, 0)  # it meets the scene, as it does in compiling
+            integrator.train(scene, 0)  # binds it to the scene, as compiling does
         keeper = _Keeper(integrator, folder)
         done = keeper.load(len(result.rows))
         del result.rows[0 if done is None else done :]
@@ -429,7 +431,7 @@ class Run:
         return plain(row), image
 
     def _guides_of(self, frame: int) -> denoise.Guides:
-        """The denoiser's guides for the state of a frame; their time belongs to nobody."""
+        """The denoiser's guides for the state of a frame; their time counts for no integrator."""
         state = self.sequence.states[frame]
         if self._guides is None or self._guides[0] != state:
             first = self._guides is None
@@ -511,7 +513,7 @@ class _Keeper:
                 with exr.replacing(folder / "cache_probe.npz") as probe:
                     integrator.save_cache(str(probe))
                 (folder / "cache_probe.npz").unlink()
-            except RuntimeError:  # settings with which no cache is ever asked
+            except RuntimeError:  # settings with which no cache is ever queried
                 self.able = False
             self.cost, self.saved = clock() - self.saved, clock()
 

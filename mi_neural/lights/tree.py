@@ -29,8 +29,8 @@ HALVES_FROM = 40
 CHUNK = 2**14
 #: Bounds are this much larger than computed, for what rounding to single precision takes away.
 SLACK = 1e-5
-#: Of a light whose radiance is known from a few samples, power counts as at least this share of the mean light's: it
-#: may have looked dark and have a bright part.
+#: Of a light whose radiance is known from a few samples, power counts as at least this share of the mean light's: its
+#: samples may have missed a bright part.
 UNCERTAIN = 0.1
 
 
