@@ -29,11 +29,11 @@ def render(
     define: options.Define = None,
     spp: Annotated[int | None, typer.Option(help="samples a pixel; default: what the scene says")] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="wall time instead of samples, training included, compiling not")
+        float | None, typer.Option(help="wall time instead of samples, with training, without compiling")
     ] = None,
     until_error: Annotated[
         float | None,
-        typer.Option(metavar="E", help="until the estimated trimmed relMSE, of noise alone, is E; at most --seconds"),
+        typer.Option(metavar="E", help="until the estimated trimmed relMSE (noise, not bias) is E; at most --seconds"),
     ] = None,
     pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before the clock starts")] = 0,
     size: options.Size = None,
