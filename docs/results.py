@@ -12,9 +12,9 @@ its row and its column say (`rows`, `columns`: null for one that stays as it is)
 is `gpu`, the table is measured on machines with an NVIDIA GPU only.
 
 Other programs write other files. `file` is then a pattern of their names in `$OUT`, and `records` the list in such a
-file whose elements take the place of groups. A record has the fields of its file beside its own; a field inside of a
-field is written with a dot (`efficiency.colours`). `each` lists what further tells the records apart that together make
-one cell. `commands` are run where one command does not measure all rows.
+file whose elements take the place of groups (`.`: the whole file is one). A record has the fields of its file beside its
+own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists what further tells the records
+apart that together make one cell. `commands` are run where one command does not measure all rows.
 """
 
 from __future__ import annotations
@@ -125,10 +125,10 @@ def collected(out: Path, pattern: str, records: str) -> dict:
     groups, environment = [], {}
     for file in sorted(out.glob(pattern)):
         data = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(data.get(records), list):
+        if not isinstance(found := [data] if records == "." else data.get(records), list):
             raise ResultsError(f"{file.name} has no list '{records}'")
         common = {key: value for key, value in data.items() if not isinstance(value, (dict, list))}
-        groups += [{**common, **_flat(record)} for record in data[records]]
+        groups += [{**common, **_flat(record)} for record in found]
         environment = data["environment"]
     if not groups:
         raise ResultsError(f"the command wrote no records: there is no {pattern} in {out}")

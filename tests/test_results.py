@@ -81,8 +81,8 @@ def test_extraction_of_every_table_fits_its_rows_and_columns(results):
     for table in found:
         assert len(table["extract"]["rows"]) == len(table["rows"])
         assert len(table["extract"]["columns"]) == len(table["columns"])
-        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "values", "as",
-                "title", "each")  # fmt: skip
+        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "width", "values",
+                "as", "title", "each")  # fmt: skip
         for part in (*table["extract"]["rows"], *table["extract"]["columns"]):
             assert not set(part or {}) - set(keys)
 
@@ -230,6 +230,33 @@ def test_efficiencies_of_the_study_are_read(results, tmp_path):
         (tmp_path / f"{row['scene']}.json").write_text(text, encoding="utf-8")
     results.fill(table, results.collected(tmp_path, "*.json", "rows"), "abc1234", None)
     assert table["rows"][6][1:] == [f"{n + 0.23:.2f}" for n in range(1, 10)]
+
+
+def test_what_a_frame_costs_is_read(results, tmp_path):
+    """As `studies/frame_profile.py` writes it, one record a file; what was measured before stays."""
+    study, table = load_study("frame_profile"), results.tables.read("frame_cost")
+    before = [row["cells"][:2] for row in results.tables.rows(table)]
+    found = {
+        "frame": {"spp": 1, "total": 0.05, "train": 0.02, "query": 0.01, "trace": 0.01, "film": 0.0005, "python": 0.0095},
+        "memory": 293.2, "query": 43.44, "network": {"ns": 50.7, "gflops": 80.0, "blas_same_shape_gflops": 100.0,
+                                                     "blas_square_gflops": 200.0},
+        "training": dict.fromkeys(("total", "records", "network", "products", "optimiser", "python",
+                                   "us_per_record_step", "us_per_record"), 2.04),
+        "first_image": {name: {"first": 9.1, "done": 12.2} for name in ("cold", "warm")},
+    }  # fmt: skip
+    for width in (320, 1920):
+        row = {"scene": "ajar_door", "width": width, "shown": study.shown(found), **found, "environment": ENVIRONMENT}
+        if width == 1920:
+            del row["first_image"]
+        (tmp_path / f"{width}.json").write_text(json.dumps(row), encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "*.json", "."), "abc1234", None)
+    assert [row[:2] for row in table["rows"]] == before
+    texts = results.tables._cells(table, [row[2] for row in table["rows"]])
+    assert texts[0] == "50.0 ms: train 40 %, query 20 %, trace 20 %, film 1.0 %, Python and launches 19.0 % (9.5 ms)"
+    assert texts[2] == "2.04 us in the step, 2.04 us with its tracing"
+    assert texts[4] == "50.7 ns, 80 GFLOP/s: 80 % of NumPy's product of its shape (100), 40 % of a large one (200)"
+    assert texts[5] == "9.1 / 9.1 s; the finished one after 12.2 / 12.2 s"
+    assert texts[6] == "293 MiB; 293 MiB at 1920x1080"
 
 
 def test_a_sequence_is_read(results, tmp_path):
