@@ -12,8 +12,8 @@ its row and its column say (`rows`, `columns`: null for one that stays as it is)
 is `gpu`, the table is measured on machines with an NVIDIA GPU only.
 
 Other programs write other files. `file` is then a pattern of their names in `$OUT`, and `records` the list in such a
-file whose elements take the place of groups (`.`: the whole file is one). A record has the fields of its file beside its
-own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists what further tells the records
+file whose elements take the place of groups (`.`: the whole file is one). A record has the fields of its file beside
+its own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists what further tells the records
 apart that together make one cell. `commands` are run where one command does not measure all rows.
 """
 

@@ -237,7 +237,8 @@ def test_what_a_frame_costs_is_read(results, tmp_path):
     study, table = load_study("frame_profile"), results.tables.read("frame_cost")
     before = [row["cells"][:2] for row in results.tables.rows(table)]
     found = {
-        "frame": {"spp": 1, "total": 0.05, "train": 0.02, "query": 0.01, "trace": 0.01, "film": 0.0005, "python": 0.0095},
+        "frame": {"spp": 1, "total": 0.05, "train": 0.02, "query": 0.01, "trace": 0.01, "film": 0.0005,
+                  "python": 0.0095},
         "memory": 293.2, "query": 43.44, "network": {"ns": 50.7, "gflops": 80.0, "blas_same_shape_gflops": 100.0,
                                                      "blas_square_gflops": 200.0},
         "training": dict.fromkeys(("total", "records", "network", "products", "optimiser", "python",
