@@ -13,8 +13,8 @@ is `gpu`, the table is measured on machines with an NVIDIA GPU only.
 
 Other programs write other files. `file` is then a pattern of their names in `$OUT`, and `records` the list in such a
 file whose elements take the place of groups (`.`: the whole file is one). A record has the fields of its file beside
-its own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists what further tells the records
-apart that together make one cell. `commands` are run where one command does not measure all rows.
+its own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists the further fields of the
+records that together make one cell. `commands` are run where one command does not measure all rows.
 """
 
 from __future__ import annotations

@@ -74,9 +74,9 @@ class NVCLightSampler(LightSampler):
     .. math:: p_i(x) \propto E_i(x) \max(V_i(x), f),
 
     :math:`f` the key ``floor``. :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines
-    at both ends (Conty Estevez and Kulla 2018). Unbiased whatever the network says, since no light that can contribute
-    has probability 0. With more lights than ``outputs`` the network knows clusters of them: a cluster is chosen as
-    above, then one light in it by resampling ``candidates`` of its lights.
+    at both ends (Conty Estevez and Kulla 2018). Unbiased whatever the network predicts, since no light that can
+    contribute has probability 0. With more lights than ``outputs`` the network has outputs for clusters of them: a
+    cluster is chosen as above, then one light in it by resampling ``candidates`` of its lights.
 
     .. pluginparameters::
 

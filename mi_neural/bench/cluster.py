@@ -1,6 +1,6 @@
 """Beyond one machine: jobs on the workers of a Dask scheduler, and images put together from parts.
 
-    dask scheduler                                  # on one machine; says its address
+    dask scheduler                                  # on one machine; prints its address
     dask worker tcp://HOST:8786 --nthreads 8        # on each machine, with mi_neural installed
 
     from mi_neural.bench import cluster

@@ -5,7 +5,7 @@
 was interrupted, from the files of :mod:`.sequence_files`.
 
 A frame is what ``mi.render`` makes of the state at that frame: an integrator with a cache trains its `train_steps`
-first, and carries over what it knows from the frames before. Kernels are compiled before the first frame.
+first, and keeps what it has learned from the frames before. Kernels are compiled before the first frame.
 
 Per frame: seconds (training and rendering), HDR-FLIP, relMSE, and SMAPE to the frame before. FLIP's exposures are the
 same for all frames: from the lowest start to the highest stop that FLIP chooses for any of the references. SMAPE at a
@@ -149,7 +149,7 @@ class Run:
         if len(result.rows) >= self.sequence.frames:
             return result
 
-        # ---- In the state of frame 0, so that a cache file is met by the scene that it was begun in
+        # ---- In the state of frame 0, so that a cache file is loaded with the scene in which it was begun
         self.sequence.apply(0)
         if self.elsewhere is None:
             self.progress(f"{case.spec.label}: compiling")

@@ -75,7 +75,7 @@ class Receiver:
 class UnshadowedLights:
     """Unshadowed reflected radiance of the lights of `table` in `scene`.
 
-    ``receive`` looks at a surface, ``radiance`` at one light from it, ``total`` sums over all of them. No randomness,
+    ``receive`` evaluates a surface, ``radiance`` one light from it, and ``total`` sums over all of them. No randomness,
     no rays. `refresh` takes over roughnesses that were changed in the scene; for changed lights there is a new table,
     hence a new object.
     """
