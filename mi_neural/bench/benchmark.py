@@ -1,6 +1,6 @@
 """Speed against error: several integrators, equal time, one reference.
 
-Kinds of rows, each raw and, if asked, denoised:
+Kinds of rows, each raw and, with ``--denoise``, also denoised:
 
 one-shot   a cache starts empty; S seconds, counted from when kernels are compiled, training included. The denoiser's
            time is reported separately and is not part of S.
@@ -138,8 +138,8 @@ class Plan:
 class Bench:
     """Measures integrators on one scene against one reference; hand each finished picture to `on_picture`.
 
-    Ctrl-C: the rendering under way is finished early, its row is marked, and ``KeyboardInterrupt`` is raised after it.
-    What `kept` holds (a :class:`~mi_neural.bench.kept.Kept`) is not measured again.
+    After Ctrl-C the current rendering is finished early, its row is marked, and ``KeyboardInterrupt`` is raised after
+    it. What `kept` holds (a :class:`~mi_neural.bench.kept.Kept`) is not measured again.
     """
 
     def __init__(

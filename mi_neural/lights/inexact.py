@@ -1,7 +1,7 @@
 """Area lights whose light Mitsuba 3.9.1 loses or invents in next-event estimation (`path`, `direct`).
 
-Its error is measured against BSDF sampling alone (``direct`` with ``emitter_samples=0``). The light table samples all
-of these by the area of their surface, which is exact.
+Errors are measured against BSDF sampling alone (``direct`` with ``emitter_samples=0``). The light table samples all of
+these by the area of their surface, which is exact.
 """
 
 from __future__ import annotations

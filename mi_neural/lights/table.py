@@ -48,16 +48,16 @@ class LightTable:
 
     emitter   index into the scene's emitters
     form      how the entry is sampled: TRIANGLE, PARALLELOGRAM, DISK, CYLINDER (CYLINDER_INSIDE: light leaves inwards):
-              uniformly by area; SPHERE: uniformly by solid angle; POINT; OTHER: as its emitter does, texels of the
-              environment apart; UNSAMPLED: shapes that Mitsuba cannot sample, whose light BSDF samples alone find
+              uniformly by area; SPHERE: uniformly by solid angle; POINT; OTHER: as its emitter does, except texels of
+              the environment; UNSAMPLED: shapes that Mitsuba cannot sample, whose light BSDF samples alone find
     corner, edge1, edge2, normal   of planes: points ``corner + u edge1 + v edge2``, with u + v <= 1 in a triangle and
               u² + v² <= 1 in a disk; unit normal, on the emitting side. Of cylinders ``corner + cos φ edge1 + sin φ
               edge2 + z normal``
     prim      primitive of the emitter's shape
     area      of what is sampled by area, and of spheres; 0 elsewhere
     radiance  mean emitted radiance of all these, intensity of points
-    plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is; nowhere but in
-              RGB variants
+    plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is; only in RGB
+              variants
     kind      LOCAL, DIRECTION or ENVIRONMENT (as a whole; its texels are of kind DIRECTION)
     center, radius   bounding sphere of a LOCAL entry; DIRECTION: `center` is the direction towards the light
     axis, cone       mean normal, and cosine of the largest angle of a normal to it; -1: light leaves in all directions.

@@ -10,8 +10,8 @@ normals. That cone is not bounded here but estimated, which changes the shape of
 mean R of the lights' axes, since normals that fill a cone evenly have R = (1 + cos θ) / 2. What nodes are *sampled* by
 is bounded: sphere and cone of :func:`~mi_neural.lights.clusters.bounds`.
 
-Lights at infinity have no place. They hang in a tree of their own beside the local ones, by direction in the place of
-position, and the environment as a whole beside them: the first choice is between near and far.
+Lights at infinity have no place. They have a tree of their own beside that of the local ones, with directions instead
+of positions, and the environment as a whole lies beside them: the first choice is between near and far.
 """
 
 from __future__ import annotations
