@@ -7,12 +7,14 @@ what was measured of a version is not measured again.
 
 `extract` names the groups of the `results.json` that `mi-neural compare` writes. A cell is the group that has all that
 its row and its column say (`rows`, `columns`: null for one that stays as it is), for example `scene`, `label`, `mode`,
-`budget_seconds`, `denoised`. `values` are the fields to show and how many digits they have; `title` renames a column.
+`budget_seconds`, `denoised`. `values` are the fields to show and how many digits they have (a text is shown as it is);
+`as` is how the cell is written, where `formats` of the table does not say it; `title` renames a column. Where `needs`
+is `gpu`, the table is measured on machines with an NVIDIA GPU only.
 
 Other programs write other files. `file` is then a pattern of their names in `$OUT`, and `records` the list in such a
-file whose elements take the place of groups. A record has the fields of its file beside its own; a field inside of a
-field is written with a dot (`efficiency.colours`). `each` lists what further tells the records apart that together make
-one cell. `commands` are run where one command does not measure all rows.
+file whose elements take the place of groups (`.`: the whole file is one). A record has the fields of its file beside
+its own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists the further fields of the
+records that together make one cell. `commands` are run where one command does not measure all rows.
 """
 
 from __future__ import annotations
@@ -59,10 +61,19 @@ def not_run(found: dict) -> str:
         return "its script was not kept"
     if "extract" not in found:
         return "nothing reads its numbers yet; type by hand"
+    if found["extract"].get("needs") == "gpu" and not has_gpu():
+        return "needs an NVIDIA GPU; type on a machine that has one"
     commands = found["extract"].get("commands", [found["command"]])
     named = [word for command in commands for word in shlex.split(command) if word in public.names()]
     needed = dict.fromkeys(name.partition("/")[0] for name in named if not public.file(name).is_file())
     return f"needs public scenes; type mi-neural scenes get {' '.join(needed)}" if needed else ""
+
+
+def has_gpu() -> bool:
+    """Whether Dr.Jit finds a CUDA device here."""
+    import drjit as dr
+
+    return dr.has_backend(dr.JitBackend.CUDA)
 
 
 def version(paths: list[str]) -> str:
@@ -114,10 +125,10 @@ def collected(out: Path, pattern: str, records: str) -> dict:
     groups, environment = [], {}
     for file in sorted(out.glob(pattern)):
         data = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(data.get(records), list):
+        if not isinstance(found := [data] if records == "." else data.get(records), list):
             raise ResultsError(f"{file.name} has no list '{records}'")
         common = {key: value for key, value in data.items() if not isinstance(value, (dict, list))}
-        groups += [{**common, **_flat(record)} for record in data[records]]
+        groups += [{**common, **_flat(record)} for record in found]
         environment = data["environment"]
     if not groups:
         raise ResultsError(f"the command wrote no records: there is no {pattern} in {out}")
@@ -136,22 +147,29 @@ def _flat(record: dict, before: str = "") -> dict:
 
 
 def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
-    """Put the numbers of `measured` into the table `found`, with their version, date and machine."""
-    extract = found["extract"]
-    cells = [list(row["cells"]) for row in tables.rows(found)]
+    """Put the numbers of `measured` into the table `found`, with their version, date and machine.
+
+    A row that is not measured keeps its own.
+    """
+    extract, before = found["extract"], tables.rows(found)
+    cells = [list(row["cells"]) for row in before]
     for k, column in enumerate(extract["columns"]):
         if column is None:
             continue
         found["columns"][k] = column.get("title", found["columns"][k])
         for line, row in zip(cells, extract["rows"], strict=True):
-            line[k] = cell({**extract, **column, **row}, measured["groups"])
+            if row is not None:
+                line[k] = cell({**extract, **column, **row}, measured["groups"])
     where = measured["environment"]
-    found.update(rows=cells, commit=commit, date=datetime.date.today().isoformat(), mitsuba=where["mitsuba"],
-                 machine=machine or f"{where['cores']} cores ({where['cpu']})")  # fmt: skip
+    machine = machine or where.get("machine") or f"{where['cores']} cores ({where['cpu']})"
+    found.update(commit=commit, date=datetime.date.today().isoformat(), mitsuba=where["mitsuba"], machine=machine)
+    kept = [{key: row[key] for key in tables.SOURCE if row[key] != found[key]} for row in before]
+    found["rows"] = [line if row is not None or not source else {"cells": line, **source}
+                     for line, row, source in zip(cells, extract["rows"], kept, strict=True)]  # fmt: skip
 
 
 #: What of `extract` says nothing about which group is meant.
-SETTINGS = ("rows", "columns", "values", "title", "file", "records", "commands", "each")
+SETTINGS = ("rows", "columns", "values", "as", "title", "file", "records", "commands", "each", "needs")
 #: What messages name first.
 FIRST = ("scene", "label", "mode", "budget_seconds", "denoised")
 
@@ -171,6 +189,8 @@ def cell(wanted: dict, groups: list[dict]) -> object:
         numbers += [_digits(found[0].get(name), digits) for name, digits in wanted["values"].items()]
     if any(number is None for number in numbers):
         return ""
+    if "as" in wanted:
+        return {"values": numbers, "as": wanted["as"]}
     return numbers if len(numbers) > 1 else numbers[0]
 
 
@@ -178,11 +198,12 @@ def _same(value, wanted) -> bool:
     return float(value) == float(wanted) if isinstance(wanted, Number) else value == wanted
 
 
-def _digits(value: float | None, digits: str) -> Number | None:
-    """A number with so many digits: `3g` or `.3f`, as in a format string."""
-    if value is None:
-        return None
+def _digits(value: float | str | None, digits: str) -> Number | str | None:
+    """A number with so many digits: `3g` or `.3f`, as in a format string; a text as it is."""
+    if value is None or isinstance(value, str):
+        return value
     text = format(value, digits if "." in digits else f".{digits}")
+    text = text if float(text) else text.removeprefix("-")
     return Number(f"{float(text):.0f}" if "e+" in text else text)
 
 

@@ -14,16 +14,16 @@ from mi_neural.render.frozen import is_recording
 class LightSampler(mi.Emitter):
     """Base of the light samplers. Subclasses give `make`.
 
-    A light sampler emits nothing: it is nested in an integrator, under the name ``light_sampler``. It is asked for the
-    object that chooses lights in a scene by ``lights(scene, sensor)``, before each image; None stands for the scene's
-    own choice.
+    A light sampler emits nothing: it is nested in an integrator, under the name ``light_sampler``. Before each image
+    the integrator calls ``lights(scene, sensor)``, which returns the object that chooses lights in this scene; None
+    stands for the scene's own choice.
     """
 
     def __init__(self, props):
         super().__init__(props)
         self.plugin = props.plugin_name()
         self.scene = BoundScene()
-        self.edits: parameters.Edits | None = None  # of the lights' parameters; None: there is nothing to choose
+        self.edits: parameters.Edits | None = None  # of the lights' parameters; None where there is nothing to choose
         self.sampler = None
         self.plan_mode = props.get("plan", "scene")
         self._check(self.plan_mode in plan.MODES,
@@ -97,7 +97,7 @@ class LightSampler(mi.Emitter):
         return f"{type(self).__name__}[plan = {self.plan or self.plan_mode}]"
 
     # -------------------------------------------------------------------------------------------------------------
-    # It is an emitter to Mitsuba, whose calls are compiled for all emitters alive: one that gives nothing
+    # To Mitsuba it is an emitter, and calls of emitters are compiled for all that are alive: this one emits nothing
 
     def eval(self, si, active=True):
         return mi.Spectrum(0)
@@ -125,7 +125,7 @@ class LightSampler(mi.Emitter):
 
 
 def _edits_of(scene) -> parameters.Edits:
-    """Of the parameters that the table is made of."""
+    """Edits of the parameters that the table is made of."""
     pairs = []
     for emitter in scene.emitters():
         shape = emitter.get_shape()

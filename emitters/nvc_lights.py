@@ -68,15 +68,15 @@ class NVCLightSampler(LightSampler):
     -------------------------------------------------------------
 
     Chooses light :math:`i` with a probability proportional to what it would give the surface without shadows, times
-    the share of it that is visible from there as a small network predicts (neural visibility cache; METHODS 4 and the
-    seed's eq. for p(x)):
+    the share of it that is visible from there as a small network predicts (neural visibility cache; Bokšanský and
+    Meister 2025, section 3):
 
     .. math:: p_i(x) \propto E_i(x) \max(V_i(x), f),
 
     :math:`f` the key ``floor``. :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines
-    at both ends (Conty Estevez and Kulla 2018). Unbiased whatever the network says, since no light that can contribute
-    has probability 0. With more lights than ``outputs`` the network knows clusters of them: a cluster is chosen as
-    above, then one light in it by resampling ``candidates`` of its lights.
+    at both ends (Conty Estevez and Kulla 2018). Unbiased whatever the network predicts, since no light that can
+    contribute has probability 0. With more lights than ``outputs`` the network has outputs for clusters of them: a
+    cluster is chosen as above, then one light in it by resampling ``candidates`` of its lights.
 
     .. pluginparameters::
 
@@ -89,7 +89,7 @@ class NVCLightSampler(LightSampler):
        - Most outputs of the network; up to that many lights are known one by one. (Default: 32)
      * - clusters
        - |string|
-       - What an output stands for where there are more lights: ``kmeans`` (near each other), ``emitter`` (all
+       - What an output is for where there are more lights than outputs: ``kmeans`` (near each other), ``emitter`` (all
          triangles of an emitter), ``auto`` (by emitter if there are few, small ones). (Default: auto)
      * - environment_cells
        - |int|
@@ -113,14 +113,14 @@ class NVCLightSampler(LightSampler):
        - Points per step; each sends one shadow ray to every output. (Default: 2048)
      * - loss
        - |string|
-       - What training lessens: ``cross_entropy``, or ``squared`` as published, which learns nothing where each light is
+       - The loss of training: ``cross_entropy``, or ``squared`` as published, which learns nothing where each light is
          seen from few points (``mi-neural doc measured``). (Default: cross_entropy)
      * - world_points
        - |float|
        - Share of these points that lie anywhere in the box of what is seen; the others lie on surfaces. (Default: 0.25)
      * - vertices
        - |int|
-       - Surfaces are those at the first so many vertices of paths from the camera. (Default: 3)
+       - The surfaces are those at the first vertices of camera paths, up to this number of vertices. (Default: 3)
      * - first_rate, last_rate
        - |float|
        - Learning rates of Adam at a place that is new, and at one that has been trained ``rate_steps`` times.
@@ -145,7 +145,7 @@ class NVCLightSampler(LightSampler):
        - Of the network's weights: ``uniform`` (Dr.Jit's), or ``he``. (Default: uniform)
      * - floor
        - |float|
-       - Visibilities below it count as it. (Default: 0.06)
+       - Smaller visibilities are raised to it. (Default: 0.06)
      * - cluster_choice
        - |string|
        - Weight of a cluster of several lights: ``received``, what it would give times its visibility, or
@@ -155,7 +155,7 @@ class NVCLightSampler(LightSampler):
        - Candidates in a cluster: by ``power``, or ``uniform``. (Default: power)
      * - freeze
        - |bool|
-       - Do not train; an untrained network says 1/2 for every light. (Default: false)
+       - Do not train; an untrained network predicts 1/2 for every light. (Default: false)
      * - seed
        - |int|
        - Of the initial weights, the training points and the clusters. (Default: 0)
@@ -164,19 +164,19 @@ class NVCLightSampler(LightSampler):
        - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
          faults. (Default: scene)
 
-    The presets: what is printed (Bokšanský and Meister 2025, sections 3.2 to 3.4 and figure 5; values behind a
+    The presets: the published value (Bokšanský and Meister 2025, sections 3.2 to 3.4 and figure 5; values behind a
     semicolon hold where lights are clustered) / the default / why it differs.
 
     - ``train_frames``: 1 / 32 / the first image has a trained network.
     - ``train_samples``, ``world_points``, ``vertices``: 8192, 0.5, 1; 49152 / 2048, 0.25, 3 / so spread, 2048 points a
       step do as well as 8192.
-    - ``loss``: squared / cross_entropy / where a lamp is seen by 2 or 3 % of the points, the squared error has all
-      predictions at 0 from the fifth step on.
+    - ``loss``: squared / cross_entropy / where a lamp is seen by 2 or 3 % of the points, with the squared error all
+      predictions are 0 from the fifth step on.
     - ``first_rate``, ``last_rate``, ``rate_steps``: 0.05, 0.001, 200 / the same; in both presets the rate falls with
       the age of a place, not with that of the network.
     - ``averaging``: none / 0.9 / not measured.
-    - ``levels``, ``base_resolution``, ``level_scale``: 10, 16, not printed (2 taken); 8, 2 / 6, 8, 1.7 / Sponza with 32
-      lamps: variance 0.453 in 148 ms, with 10 levels from 16 on 0.514 in 160 ms.
+    - ``levels``, ``base_resolution``, ``level_scale``: 10, 16, not published (2 is used); 8, 2 / 6, 8, 1.7 / Sponza
+      with 32 lamps: variance 0.453 in 148 ms, with 10 levels from 16 on 0.514 in 160 ms.
     - ``init``: he / uniform / not measured.
     - ``floor``: 0.001 / 0.06 / Sponza with 32 lamps: relMSE 0.13 (trimmed 0.10), with 0.001 2.1 (0.09).
     - ``cluster_choice``, ``within``: visibility, uniform / received, power / not measured.

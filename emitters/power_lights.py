@@ -13,9 +13,9 @@ class PowerLightSampler(LightSampler):
     Choice of lights by power (:monosp:`power_lights`)
     ---------------------------------------------------
 
-    Chooses light :math:`i` with a probability proportional to its power :math:`\Phi_i`, those at infinity by what they
-    give the whole scene; a tenth is shared equally. A light is an emissive triangle (a rectangle counts as one light),
-    or any other emitter as a whole. Unbiased.
+    Chooses light :math:`i` with a probability proportional to its power :math:`\Phi_i`, or, for lights at infinity, to
+    what they give the whole scene; a tenth of the probability is shared equally. A light is an emissive triangle (a
+    rectangle counts as one light), or any other emitter as a whole. Unbiased.
 
     .. pluginparameters::
 
@@ -25,7 +25,7 @@ class PowerLightSampler(LightSampler):
          faults. (Default: scene)
 
     *Works with* all emitters of Mitsuba, nested in an integrator of this package under the name ``light_sampler``.
-    Knows nothing of distance, direction or shadows: ``nvc_lights`` does.
+    *Leaves out* distance, direction and shadows (use ``nvc_lights``).
 
     .. tabs::
         .. code-tab:: xml

@@ -22,7 +22,7 @@ class TreeLightSampler(LightSampler):
     :math:`c'` the sibling of :math:`c`, :math:`\Phi_c` and :math:`r_c` its power and radius, :math:`d_c` its distance,
     and the cosines the largest that its bounding sphere and its cone of normals allow. Unbiased: no light that can
     reach the surface has probability 0. Time grows with the logarithm of the number of lights. Nothing is learned, and
-    nothing is known of shadows.
+    shadows are not considered.
 
     .. pluginparameters::
 
@@ -39,7 +39,7 @@ class TreeLightSampler(LightSampler):
     under the name ``light_sampler``. *Leaves out* adaptive splitting (several lights for one surface) and shadows:
     where most lights are hidden from most places, ``nvc_lights`` has less noise. With 1,000 lamps behind partitions it
     had 0.2 to 0.6 of this one's error in equal time, with 32 lamps 0.4 to 1.3 (``mi-neural doc lights``). Points in
-    participating media count light from all directions alike; what media absorb on the way is not known.
+    participating media count light from all directions alike; what media absorb on the way is not considered.
 
     .. tabs::
         .. code-tab:: xml

@@ -38,7 +38,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
     With ``mode="sampled"`` each shadow ray goes to a light that the ``light_sampler`` chooses, by default one that has
     learned which lights are visible from where, and a BSDF ray is weighted against it: unbiased, whatever was learned.
     With ``mode="neural"`` there are no shadow rays: all lights are summed, each as it would be without shadows, times
-    its predicted visibility (the seed's "neural direct illumination"),
+    its predicted visibility (the "neural direct illumination" of Bokšanský and Meister 2025),
 
     .. math:: L = L_e + \sum_k V_k(x) \int f L_k \cos\theta\, d\omega,
 

@@ -1,19 +1,17 @@
 """``restir_di``: direct light by reuse of light samples over pixels and frames."""
 
-import copy
-from dataclasses import dataclass, replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mi_neural.estimators import reservoir
-from mi_neural.estimators.mis import mis_weight
 from mi_neural.estimators.reservoir import Reservoir
+from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import refuse_gradients
 from mi_neural.integrators.checks import check_film, check_scene, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
+from mi_neural.integrators.restir_past import Past, alike, camera_of, nothing, reproject, slim_surface
 from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
@@ -28,20 +26,6 @@ CANDIDATES = ("light", "nvc")
 NVC_WHERE = ("everywhere", "disoccluded")
 #: What a pixel takes in memory while a frame is rendered (measured on two cores: 470 to 570 bytes).
 PIXEL_BYTES = 640
-
-
-@dataclass
-class Past:
-    """What one frame leaves to the next, one entry a pixel.
-
-    kept     what was kept of the light samples
-    surface  what the pixel's camera ray met, as far as a BSDF asks for it
-    usable   whether that has a smooth lobe
-    """
-
-    kept: Reservoir
-    surface: mi.SurfaceInteraction3f
-    usable: mi.Bool
 
 
 class _State:
@@ -238,9 +222,9 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             s.key, s.freeze = key, can_freeze_scene(scene)
 
         lights, facts = self._lights(scene, recordable(sensor, s.frame))
-        camera, pinhole = _camera(sensor)
+        camera, pinhole = camera_of(sensor)
         if s.past is None or s.past_power.table.n_lights != s.power.table.n_lights:
-            s.past = _nothing(area.n_pixels)
+            s.past = nothing(area.n_pixels)
             s.past_power, s.past_camera = s.power, camera
         s.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         records = s.freeze and not is_recording()
@@ -307,10 +291,10 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             L, valid, si, usable, sampler = self.first_surface(scene, ray, sampler, power)
 
             # ------------- Where that was in the frame before -------------
-            before, found = self.reproject(si, past, past_camera, size, border, pixel, pinhole, usable)
+            before, found = reproject(self, si, past, past_camera, size, border, pixel, pinhole, usable)
 
             # ----------------- Initial candidates, one ray ----------------
-            kept = self.initial(scene, lights, power, si, found, sampler, usable)
+            kept = samples.initial(self, scene, lights, power, si, found, sampler, usable)
 
             # --------------------- Reuse over frames ----------------------
             if self.history > 0:
@@ -322,10 +306,10 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
                 kept = self.reuse_pixels(scene, power, si, kept, usable, pixel, width, height, sampler)
 
             # -------------------------- Shade -----------------------------
-            f, p_light = self.contribution(scene, power, si, kept.index, kept.uv, usable & (kept.W > 0))
+            f, p_light = samples.contribution(self, scene, power, si, kept.index, kept.uv, usable & (kept.W > 0))
             shown = usable & (kept.W > 0)
             if not self.unbiased:  # else the target knows it
-                shown &= _visible(scene, si, p_light, shown)
+                shown &= samples.visible(scene, si, p_light, shown)
             L = w_camera * (L + vertex.finite(f * kept.W, shown))
             ok = dr.all(dr.isfinite(L))
             L = dr.select(ok, L, 0)
@@ -349,7 +333,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         found, sampler = paths.bounce(scene, power, path, sampler, direct=self.emission_met)
         valid = paths.advance(path, found).valid
         L = path.L + path.β * found.direct
-        return L, valid, _slim(path.si), vertex.is_smooth(path.si, path.active), sampler
+        return L, valid, slim_surface(path.si), vertex.is_smooth(path.si, path.active), sampler
 
     def emission_met(self, scene, power, path, bsdf, found, numbers, sampler, alone=None):
         """As `paths.direct_light`: no light sample, and the share of the BSDF ray in the emission that it met."""
@@ -357,122 +341,19 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         hit, emits = table.index_of(scene, found.si, found.followed)
         ds = mi.DirectionSample3f(scene, found.si, vertex.reference_point(si.p, si.n))
         pdf_light = table.pdf(scene, si, hit, found.si, ds, emits & ~delta)
-        share = dr.select(delta, 1, 1 - self.light_share(power, hit, pdf_light, found.bs.pdf, emits))
+        share = dr.select(delta, 1, 1 - samples.light_share(self, power, hit, pdf_light, found.bs.pdf, emits))
         Le = found.si.emitter(scene, emits).eval(found.si, emits)
         return mi.Color3f(0), dr.select(emits, Le * share, 0), sampler
-
-    def light_share(self, power, index, pdf, pdf_bsdf, active):
-        """Share of light samples in what reaches a surface from a point on light `index`; the rest is the BSDF ray's.
-
-        A fixed partition of the light, however lights are sampled: `initial_candidates` of them in proportion to power
-        against one of the BSDF (Veach 1997, eq. 9.13).
-        """
-        pmf = power.pmf(None, None, None, index, active)
-        return mis_weight(self.initial_candidates * pmf * pdf, pdf_bsdf)
-
-    def contribution(self, scene, power, si, index, uv, active):
-        """What a light sample gives, shadows apart: (share times f Le cos over the density of `uv`, point on it)."""
-        ds, weight, pdf = power.table.sample(scene, si, index, uv, active)
-        active = active & (pdf > 0)
-        f, pdf_bsdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-        share = dr.select(ds.delta, 1, self.light_share(power, index, pdf, pdf_bsdf, active))
-        return vertex.finite(f * weight * share, active), ds.p
-
-    def target(self, scene, power, si, index, uv, active):
-        """What light samples are kept in proportion to: the mean of the channels, of visible ones if `unbiased`."""
-        f, p_light = self.contribution(scene, power, si, index, uv, active)
-        value = dr.mean(f)
-        if self.unbiased:
-            value = dr.select(_visible(scene, si, p_light, active & (value > 0)), value, 0)
-        return value
-
-    def initial(self, scene, lights, power, si, found, sampler, active) -> Reservoir:
-        """A reservoir of this frame's own candidates, confidence 1; its W is 0 where the kept one is in shadow.
-
-        E[g W] = integral of g over what is visible (Bitterli et al. 2020, alg. 3; visibility as in alg. 5).
-        """
-        n_candidates = self.initial_candidates
-        n, transmits = vertex.receiver(si, si.bsdf())
-
-        def draw(lights, sampler, active):
-            lights = _remembering(lights, si, n, transmits)
-
-            def candidate(i, kept, sampler):
-                u = (mi.Float(i) + sampler.next_1d()) * (1 / n_candidates)
-                choice = lights.choose(si, n, transmits, u, sampler, mi.UInt32(0), active)
-                sampler = choice.advanced(sampler)
-                uv = sampler.next_2d()
-                f, _ = self.contribution(scene, power, si, choice.index, uv, active & (choice.weight > 0))
-                target = dr.mean(f)
-                kept = reservoir.update(kept, choice.index, uv, target * choice.weight, target, sampler.next_1d())
-                return i + 1, kept, sampler
-
-            _, kept, sampler = dr.while_loop(
-                (mi.UInt32(0), Reservoir.empty(dr.width(si)), sampler), lambda i, *_: active & (i < n_candidates),
-                candidate, label="initial candidates",
-            )  # fmt: skip
-            return kept, sampler
-
-        if self.candidates == "nvc" and self.nvc_where == "disoccluded":
-            kept, sampler = draw(power, sampler, active & found)
-            # A loop of at most one round: nothing is computed where no pixel of a packet is new
-            _, kept, sampler = dr.while_loop(
-                (active & ~found, kept, sampler), lambda new, *_: new,
-                lambda new, _, sampler: (mi.Bool(False), *draw(lights, sampler, new)), label="disoccluded",
-            )  # fmt: skip
-        else:
-            kept, sampler = draw(lights, sampler, active)
-        kept = replace(reservoir.finish(kept), M=dr.select(active, mi.Float(1), 0))
-        lit = active & (kept.W > 0)
-        _, p_light = self.contribution(scene, power, si, kept.index, kept.uv, lit)
-        lit &= _visible(scene, si, p_light, lit)
-        return replace(kept, W=dr.select(lit, kept.W, 0), target=dr.select(lit, kept.target, 0))
-
-    def reproject(self, si, past, past_camera, size, border, pixel, pinhole, active):
-        """Pixel of the frame before that saw the point `si`, or one beside it that saw the same surface, as at edges:
-        (its number, whether there is one)."""
-        to_film, origin = past_camera
-        width, height = (n + 2 * border for n in size)
-        x, y, inside = mi.Int32(pixel % width), mi.Int32(pixel // width), mi.Bool(active)
-        distance = dr.norm(si.p - origin)
-        if pinhole:
-            film = to_film @ mi.Vector3f(si.p - origin)
-            inv_z = dr.rcp(dr.select(film.z > 0, film.z, 1))
-            u, v = film.x * inv_z * size[0] + border, film.y * inv_z * size[1] + border
-            inside &= (film.z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-            x, y = mi.Int32(dr.select(inside, u, 0)), mi.Int32(dr.select(inside, v, 0))
-
-        def look(x, y, inside):
-            inside = inside & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            lane = mi.UInt32(dr.select(inside, x + y * width, 0))
-            there = dr.gather(mi.SurfaceInteraction3f, past.surface, lane, inside)
-            seen = inside & dr.gather(mi.Bool, past.usable, lane, inside)
-            return lane, seen & self.alike(si, distance, there, dr.norm(there.p - origin))
-
-        def beside(k, _, found):
-            lane, found = look(x + dr.select(k < 2, 2 * k - 1, 0), y + dr.select(k < 2, 0, 2 * k - 5), inside)
-            return k + 1, lane, found
-
-        before, found = look(x, y, inside)
-        _, before, found = dr.while_loop(
-            (mi.Int32(0), before, found), lambda k, _, found: inside & ~found & (k < 4), beside, label="pixels beside"
-        )
-        return before, found
-
-    def alike(self, a, distance_a, b, distance_b):
-        """Whether two surfaces may share light samples: their normals and distances from the camera are close."""
-        facing = dr.dot(vertex.facing(a), vertex.facing(b)) >= self.normal_threshold
-        return facing & (dr.abs(distance_a - distance_b) <= self.depth_threshold * distance_a)
 
     def reuse_frame(self, scene, power, past_power, si, kept, past, before, found, sampler) -> Reservoir:
         """Combine with what the pixel `before` kept in the last frame."""
         old = reservoir.clamp_history(past.kept.at(before, found), self.history)
-        target = self.target(scene, power, si, old.index, old.uv, found & (old.W > 0))
+        target = samples.target(self, scene, power, si, old.index, old.uv, found & (old.W > 0))
         us = [sampler.next_1d(), sampler.next_1d()]
         if not self.unbiased:
             return reservoir.combine([kept, old], [kept.target, target], us)
         si_old = dr.gather(mi.SurfaceInteraction3f, past.surface, before, found)
-        swapped = self.target(scene, past_power, si_old, kept.index, kept.uv, found & (kept.W > 0))
+        swapped = samples.target(self, scene, past_power, si_old, kept.index, kept.uv, found & (kept.W > 0))
         shares = [reservoir.balance(kept.M, kept.target, old.M, swapped),
                   reservoir.balance(old.M, old.target, kept.M, target)]  # fmt: skip
         return reservoir.combine([kept, old], [kept.target, target], us, shares)
@@ -491,13 +372,13 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             lane = mi.UInt32(dr.select(near, x + y * width, 0))
             near &= (lane != pixel) & dr.gather(mi.Bool, usable, lane, near)
             si_near = dr.gather(mi.SurfaceInteraction3f, si, lane, near)
-            near &= self.alike(si, si.t, si_near, si_near.t)
+            near &= alike(self, si, si.t, si_near, si_near.t)
             other = kept.at(lane, near)
 
-            target = self.target(scene, power, si, other.index, other.uv, near & (other.W > 0))
+            target = samples.target(self, scene, power, si, other.index, other.uv, near & (other.W > 0))
             share = other.M
             if self.unbiased:
-                swapped = self.target(scene, power, si_near, kept.index, kept.uv, near & (kept.W > 0))
+                swapped = samples.target(self, scene, power, si_near, kept.index, kept.uv, near & (kept.W > 0))
                 share, _ = reservoir.pairwise(other.M, other.target, kept.M, target, n)
                 own_share += reservoir.pairwise(other.M, swapped, kept.M, kept.target, n)[1]
             total = reservoir.merge(total, other, target, share, sampler.next_1d())
@@ -533,11 +414,6 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         )
 
 
-def _visible(scene, si, p_light, active):
-    """Whether nothing stands between a surface and a point on a light; false where not `active`."""
-    return active & ~scene.ray_test(si.spawn_ray_to(p_light), active)
-
-
 def _numbers(pixel, seed, frame, salt: int) -> PathSampler:
     """Random numbers of a frame."""
     scramble, _ = mi.sample_tea_32(pixel, seed, 4)
@@ -545,68 +421,9 @@ def _numbers(pixel, seed, frame, salt: int) -> PathSampler:
     return PathSampler.make(pixel, stream ^ salt, index=frame, scramble=scramble)
 
 
-def _slim(si):
-    """A copy of what BSDFs and light samples ask of a surface; the rest is 0 and takes no memory."""
-    slim = dr.zeros(mi.SurfaceInteraction3f, dr.width(si))
-    for name in ("t", "p", "n", "uv", "sh_frame", "dp_du", "dp_dv", "wi", "shape", "prim_index"):
-        setattr(slim, name, getattr(si, name))
-    return slim
-
-
-def _nothing(n: int) -> Past:
-    """A past in which nothing was seen."""
-    past = Past(Reservoir.empty(n), dr.zeros(mi.SurfaceInteraction3f, n), dr.zeros(mi.Bool, n))
-    kept = past.kept
-    slim = past.surface
-    dr.make_opaque(kept, past.usable, slim.t, slim.p, slim.n, slim.uv, slim.sh_frame, slim.dp_du, slim.dp_dv, slim.wi,
-                   slim.shape, slim.prim_index)  # fmt: skip
-    return past
-
-
 def _facts(table) -> tuple:
     """What a recorded function takes for granted of a light table."""
     return (table.n_lights, table.any_flat, table.all_flat, table.all_plain, tuple(table.kinds))
-
-
-def _remembering(lights, si, n, transmits):
-    """The same choice of lights at the same surface, again and again; a network is queried once."""
-    if not hasattr(lights, "weights"):
-        return lights
-    weights = lights.weights(si.p, n, transmits)
-    lights = copy.copy(lights)
-    lights.weights = lambda *_: weights
-    return lights
-
-
-def _camera(sensor) -> tuple:
-    """((matrix, eye), pinhole): the matrix takes ``p - eye`` to the film, (x, y, 1) z with x and y in [0, 1].
-
-    Found from rays through the film's corners, so that it holds for any pinhole camera, shifted ones too; `pinhole` is
-    false where the rays do not meet or a further one disagrees, and the matrix then means nothing.
-    """
-    x, y = np.array([0, 1, 0, 1, 0.3], np.float32), np.array([0, 0, 1, 1, 0.6], np.float32)
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
-    d = np.array(ray.d + dr.zeros(mi.Vector3f, 5), np.float64)
-    o = np.array(ray.o + dr.zeros(mi.Point3f, 5), np.float64)
-    to_film, eye, pinhole = np.eye(3), o.mean(axis=1), False
-    # The point nearest to all rays: they start on the near plane
-    across = np.eye(3)[None] - np.einsum("ir,jr->rij", d, d)
-    if np.linalg.matrix_rank(across.sum(axis=0), tol=1e-6) == 3 and np.linalg.matrix_rank(d[:, 1:4], tol=1e-6) == 3:
-        eye = np.linalg.solve(across.sum(axis=0), np.einsum("rij,jr->i", across, o))
-        # Corners of a parallelogram: d0 + l3 d3 = l1 d1 + l2 d2
-        l1, l2, l3 = np.linalg.solve(np.stack([d[:, 1], d[:, 2], -d[:, 3]], axis=1), d[:, 0])
-        basis = np.stack([l1 * d[:, 1] - d[:, 0], l2 * d[:, 2] - d[:, 0], d[:, 0]], axis=1)
-        if min(l1, l2, l3) > 0 and np.linalg.matrix_rank(basis, tol=1e-6) == 3:
-            to_film = np.linalg.inv(basis)
-            a, b, c = to_film @ d[:, 4]
-            miss = np.abs(np.einsum("rij,jr->ir", across, o - eye[:, None])).max()
-            pinhole = bool(c > 0 and abs(a / c - 0.3) < 1e-3 and abs(b / c - 0.6) < 1e-3
-                           and miss <= 1e-4 * (1 + np.abs(o).max()))  # fmt: skip
-    # Matrices of Dr.Jit are written row by row
-    matrix = mi.Matrix3f(to_film.tolist())
-    eye = mi.Point3f(*eye.tolist())
-    dr.make_opaque(matrix, eye)
-    return (matrix, eye), pinhole
 
 
 register("restir_di", ReSTIRDirectIntegrator)

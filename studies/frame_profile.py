@@ -169,6 +169,18 @@ def profile(scene, integrator, spp: int, frames: int) -> dict[str, object]:
     return found
 
 
+def shown(found: dict) -> dict[str, float]:
+    """The numbers of the manual's table in its units: ms, percent of the frame or of the product, MiB."""
+    total = found["frame"]["total"]
+    numbers = {"frame": 1e3 * total, "python": 1e3 * found["frame"]["python"], "memory": found["memory"]}
+    numbers |= {f"{name}_percent": 100 * seconds / total for name, seconds in found["frame"].items()
+                if name not in ("spp", "total") and seconds is not None}  # fmt: skip
+    if (network := found.get("network")) is not None:
+        for name in ("same_shape", "square"):
+            numbers[f"blas_{name}_percent"] = 100 * network["gflops"] / network[f"blas_{name}_gflops"]
+    return numbers
+
+
 def table(found: dict) -> list[tuple[str, str]]:
     """Rows (what, how much) of a printed table."""
     total = found["frame"]["total"]
@@ -226,7 +238,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name, value in table(found):
         print(f"{name:<28}{value}", flush=True)
     if options.output:
-        row = {"scene": loaded.name, "size": list(loaded.size), "integrator": spec.label, **found}
+        row = {"scene": loaded.name, "size": list(loaded.size), "width": loaded.size[0], "integrator": spec.label,
+               "shown": shown(found), **found}  # fmt: skip
         exr.write_text(options.output, json.dumps({**row, "environment": environment.describe()}, indent=1) + "\n")
     return 0
 

@@ -10,7 +10,7 @@ step     milliseconds of a training step
 query    nanoseconds of a query of the cache, 2^20 at once
 mean     of the image against that of ``path``, 256 samples a pixel
 
-All of it goes into ``figures.json`` and ``figures.md`` with the card's name.
+All of it goes into ``figures.json`` and ``figures.md`` with the card's name, after each integrator anew.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ import mi_neural  # isort: skip  (first: it chooses the LLVM library)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from mi_neural.bench import environment, load
 
 #: Integrators of the table: label and keys.
 INTEGRATORS = {
@@ -84,7 +86,8 @@ def card(variant: str) -> str:
     if not variant.startswith("cuda"):
         return "the CPU, not a GPU"
     query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
-    return subprocess.run(query, capture_output=True, text=True, check=True).stdout.strip()
+    name, driver = subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()[0].split(", ")
+    return f"one {name}, driver {driver}"
 
 
 def table(rows: list[dict], machine: str) -> str:
@@ -101,7 +104,7 @@ def table(rows: list[dict], machine: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", default=SCENES, help="Mitsuba XML files, or names of shipped scenes")
+    parser.add_argument("scenes", nargs="*", default=SCENES, help="XML files, or names that mi-neural scenes lists")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/gpu"))
     parser.add_argument("--size", default="640x360", help="WIDTHxHEIGHT of the films")
     parser.add_argument("--variant", default="cuda_ad_rgb")
@@ -111,13 +114,16 @@ def main() -> None:
     if args.variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         parser.error("there is no CUDA device here; to try the script on a CPU type: --variant llvm_ad_rgb")
     mi.set_variant(args.variant)
-    from mi_neural import scenes
+    try:
+        files = [load.find_scene(name) for name in args.scenes]
+    except load.InputError as error:
+        parser.error(str(error))
 
     args.output.mkdir(parents=True, exist_ok=True)
     machine, rows = card(args.variant), []
+    made_with = {**environment.describe(), "machine": machine}
     width, height = (int(n) for n in args.size.split("x"))
-    for name in args.scenes:
-        file = Path(name) if Path(name).suffix == ".xml" else scenes.path(name)
+    for file in files:
         scene, reference = mi.load_file(str(file), resx=width, resy=height, parallel=False), None
         label = file.parent.name if file.stem == "scene" else file.stem
         for integrator, keys in INTEGRATORS.items():
@@ -132,7 +138,8 @@ def main() -> None:
                 row["error"] = str(e).splitlines()[0][:200]
             rows.append(row)
             print(row, flush=True)
-            (args.output / "figures.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1))
+            found = {"machine": machine, "rows": rows, "environment": made_with}
+            (args.output / "figures.json").write_text(json.dumps(found, indent=1))
             (args.output / "figures.md").write_text(table(rows, machine))
     print(table(rows, machine))
 

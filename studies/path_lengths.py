@@ -1,11 +1,11 @@
-"""How many rays the caches save at equal bias: ``python studies/path_lengths.py SCENE --reference R -o DIR``.
+"""How many rays the caches save at equal bias: ``python studies/path_lengths.py SCENE -o DIR``.
 
 Both caches are trained once; then images are made for a row of spread thresholds, from stopping as early as possible to
 hardly ever, and the squared bias of each is drawn over its mean path length, as on the project page of the incident
 cache (Dereviannykh et al. 2025). The length is the number of rays that carry reflected light to the first surface that
 is neither mirror nor glass (channel ``depth``, less what ``nrc`` has with c = 0). Rays that find direct light alone
 (shadow rays, the BSDF ray that shares the work with them) do not count: both integrators trace them at each vertex that
-does not query the outgoing cache.
+does not query the outgoing cache. The reference is the image beside the scene, or another with ``--reference``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_neural.bench import environment, load
-from mi_neural.bench.reference import Reference, load_reference
+from mi_neural.bench import environment, load, terminal
+from mi_neural.bench import reference as references
+from mi_neural.bench.reference import Reference
 from mi_neural.image import exr
 from mi_neural.image.metrics import bias_and_variance
 
@@ -79,7 +80,8 @@ def factors(points: list[Point]) -> list[dict]:
 
     `rays_nrc`: along the lower envelope of its points, log of the bias linear in the rays; `rays_nrc_measured`: of that
     point with fewest rays whose bias is no larger. None: it does not reach that bias. `factor`: ratio of the first to
-    the rays of ``nirc``; None where either is missing or ``nirc`` traces none.
+    the rays of ``nirc``, `factor_measured` of the second; None where either is missing or ``nirc`` traces none.
+    `rays_first`, `bias_first` are the point of ``nrc`` with fewest rays, `rays_second`, `bias_second` the next one.
     """
     nrc = sorted((p for p in points if p.integrator == "nrc"), key=lambda p: p.rays)
     rays = [p.rays for p in nrc]
@@ -93,10 +95,25 @@ def factors(points: list[Point]) -> list[dict]:
         if measured is not None and k > 0:
             t = math.log(bias[k - 1] / target) / math.log(bias[k - 1] / bias[k])
             needed = rays[k - 1] + t * (rays[k] - rays[k - 1])
-        ratio = needed / p.rays if needed is not None and p.rays > 0 else None
-        out.append({"threshold": p.threshold, "bias": p.bias, "rays": p.rays, "rays_nrc": needed,
-                    "rays_nrc_measured": measured, "factor": ratio})  # fmt: skip
+        ratios = [n / p.rays if n is not None and p.rays > 0 else None for n in (needed, measured)]
+        row = {"threshold": p.threshold, "bias": p.bias, "rays": p.rays, "rays_nrc": needed,
+               "rays_nrc_measured": measured, "factor": ratios[0], "factor_measured": ratios[1]}  # fmt: skip
+        for name, q in zip(("first", "second"), nrc, strict=False):
+            row |= {f"rays_{name}": q.rays, f"bias_{name}": q.bias}
+        out.append(row)
     return out
+
+
+def scene_and_reference(name: str, file: str | None, size) -> tuple[load.LoadedScene, Reference]:
+    """The scene and the image that it is compared with. Raises ``InputError`` where there is none."""
+    if file is not None:
+        reference = references.load_reference(file, size)
+        return load.load_scene(name, size=size or reference.rgb.shape[1::-1]), reference
+    loaded = load.load_scene(name, size=size)
+    if (beside := references.beside(loaded.path, loaded.size)) is None:
+        width, height = loaded.size
+        raise load.InputError(f"no reference of {width}x{height} lies beside {loaded.path}: add --reference FILE.exr")
+    return loaded, references.load_reference(beside, loaded.size)
 
 
 def plot(points: list[Point], title: str):
@@ -120,7 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
     """The command."""
     parser = argparse.ArgumentParser(prog="python studies/path_lengths.py", description=__doc__)
     parser.add_argument("scene", help="scene file or shipped scene")
-    parser.add_argument("--reference", required=True, help="EXR, of the size that is rendered")
+    parser.add_argument("--reference", help="EXR, of the size that is rendered; default: the one beside the scene")
+    parser.add_argument("--size", help="WxH; default: that of the reference, or of the scene")
     parser.add_argument("--frames", type=int, default=300, help="training frames")
     parser.add_argument("--samples", type=int, default=64, help="samples a pixel of each of two images")
     parser.add_argument("--max-depth", type=int, default=64)
@@ -133,9 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     mi.set_variant(options.variant)
     try:
-        reference = load_reference(options.reference)
-        size = reference.rgb.shape[1::-1]
-        loaded = load.load_scene(options.scene, size=size)
+        loaded, reference = scene_and_reference(options.scene, options.reference, terminal.parse_size(options.size))
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -195,20 +195,20 @@ def test_history_follows_the_camera(move, kept):
 
 def test_point_is_found_where_the_camera_saw_it():
     """The matrix of the camera before leads a surface to its own pixel, shifted and cropped films included."""
-    module = importlib.import_module("mi_neural.integrators.restir_di")
+    module = importlib.import_module("mi_neural.integrators.restir_past")
     sensor = mi.load_dict({
         "type": "perspective", "fov": 40, "principal_point_offset_x": 0.2, "near_clip": 0.3,
         "to_world": mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 1, 0]),
         "film": {"type": "hdrfilm", "width": 40, "height": 30, "crop_offset_x": 5, "crop_width": 20},
     })  # fmt: skip
-    (to_film, eye), pinhole = module._camera(sensor)
+    (to_film, eye), pinhole = module.camera_of(sensor)
     assert pinhole
     pos = mi.Point2f([0.1, 0.5, 0.9], [0.7, 0.2, 0.4])
     ray, _ = sensor.sample_ray(0, 0.5, pos, mi.Point2f(0.5))
     film = to_film @ mi.Vector3f(ray(mi.Float(1, 5, 30)) - eye)
     np.testing.assert_allclose(np.array([film.x / film.z, film.y / film.z]), np.array(pos), atol=1e-4)
     assert (np.array(film.z) > 0).all()
-    assert not module._camera(mi.load_dict({"type": "orthographic"}))[1]
+    assert not module.camera_of(mi.load_dict({"type": "orthographic"}))[1]
 
 
 def film_of_another_kind() -> dict:

@@ -1,9 +1,17 @@
 """docs/results.py: numbers of a comparison into a table."""
 
 import json
+import shlex
 import sys
+from itertools import pairwise
 
+import mitsuba as mi
 import pytest
+from load_study import load_study
+
+from mi_neural import scenes
+from mi_neural.bench import load
+from mi_neural.scenes import public
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +81,55 @@ def test_extraction_of_every_table_fits_its_rows_and_columns(results):
     for table in found:
         assert len(table["extract"]["rows"]) == len(table["rows"])
         assert len(table["extract"]["columns"]) == len(table["columns"])
-        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "values", "title", "each")
+        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "width", "values",
+                "as", "title", "each")  # fmt: skip
         for part in (*table["extract"]["rows"], *table["extract"]["columns"]):
             assert not set(part or {}) - set(keys)
+
+
+def test_commands_of_every_table_name_what_exists(results):
+    """Scripts, scenes and integrators with their keys; so a run does not fail after hours at the last of them."""
+    mi.set_variant("llvm_ad_rgb")
+    known, built = {*scenes.names(), *public.names()}, set()
+    for file in results.tables.RESULTS.glob("*.json"):
+        table = results.tables.read(file.stem)
+        extract = table.get("extract", {})
+        for words in map(shlex.split, extract.get("commands", [table["command"]] if extract else [])):
+            assert words[0] in ("python", "mi-neural"), file.name
+            assert words[0] == "mi-neural" or (results.ROOT / words[1]).is_file(), file.name
+            built |= {after for word, after in pairwise(words) if word == "-i"}
+            named = [word.removesuffix(".xml") for word in words[2:] if "sponza" in word or "veach" in word]
+            assert not {word for word in named if not word.startswith("$OUT")} - known, file.name
+    assert len(built) > 20
+    for text in sorted(built):
+        load.build_integrator(load.parse_integrator(text))
+
+
+def test_a_table_of_a_gpu_waits_for_one(results, table, monkeypatch):
+    asked = {**table, "extract": {**table["extract"], "needs": "gpu"}}
+    monkeypatch.setattr(results, "has_gpu", lambda: True)
+    assert results.not_run(asked) == ""
+    monkeypatch.setattr(results, "has_gpu", lambda: False)
+    assert "NVIDIA GPU" in results.not_run(asked) and results.not_run(table) == ""
+
+
+def test_a_row_that_is_not_measured_keeps_its_source(results, table):
+    table["extract"]["rows"][1] = None
+    results.fill(table, {"groups": GROUPS, "environment": ENVIRONMENT}, "abc1234", None)
+    kept = table["rows"][1]
+    assert kept["cells"] == ["b", ["9", "9"], ""]
+    assert (kept["commit"], kept["date"], kept["machine"]) == ("older", "2026-01-01", "m") and "command" not in kept
+    assert table["rows"][0] == ["a", ["0.123", "0.100"], ["2e-05", "0.100"]]
+
+
+def test_cells_are_written_as_the_column_says(results):
+    """Texts among the values as they are; a machine that names itself is in the caption."""
+    wanted = {"scene": "a", "values": {"ms": ".0f", "split": "3g"}, "as": "{} ({})"}
+    found = results.cell(wanted, [{"scene": "a", "ms": 12.7, "split": "4 paths"}])
+    assert found == {"values": ["13", "4 paths"], "as": "{} ({})"}
+    table = {**of(results, "gpu"), "extract": {"rows": [None] * 7, "columns": [None] * 7}}
+    results.fill(table, {"groups": [], "environment": {**ENVIRONMENT, "machine": "one GPU"}}, "abc1234", None)
+    assert table["machine"] == "one GPU"
 
 
 def test_a_command_runs_once_and_is_read(results, table, tmp_path, monkeypatch):
@@ -113,6 +167,97 @@ def test_gradients_of_the_study_are_read(results, tmp_path):
     results.fill(table, results.collected(tmp_path, "*.json", "lines"), "abc1234", None)
     assert table["rows"][1][1:] == [["2.0", "3.0"], ["3.0", "3.0"], ["1.4", "1.4"], ["0.010", "0.020"]]
     assert table["rows"][2][1:] == [["2.0", "3.0"], ["4.0", "4.0"], "", ["0.010", "0.020"]]
+
+
+def test_figures_of_a_gpu_are_read(results, tmp_path):
+    """As `studies/gpu_figures.py` writes them: `path` has no cache, and nothing that its mean is compared with."""
+    table = of(results, "gpu")
+    rows = [{**row, "first": 0.5604, "frame": 10.04, "sample": 132.7,
+             **({} if row["integrator"] == "path" else {"mean": -0.04, "step": 5.43, "query": 0.067})}
+            for row in table["extract"]["rows"]]  # fmt: skip
+    text = json.dumps({"machine": "one NVIDIA H200", "rows": rows, "environment": ENVIRONMENT})
+    (tmp_path / "figures.json").write_text(text, encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "figures.json", "rows"), "abc1234", None)
+    assert table["rows"][0][1:] == ["0.56", "10", "133", "", "", ""]
+    assert table["rows"][2][1:] == ["0.56", "10", "133", "5.43", "0.07", "-0.04"]
+
+
+def test_path_lengths_of_the_study_are_read(results, tmp_path):
+    """As `studies/path_lengths.py` writes them, a folder a scene; without rays of `nirc` there is no factor."""
+    study = load_study("path_lengths")
+    for scene in ("sun", "staircase2", "veach-ajar", "cornell-box"):
+        points = [study.Point("nrc", 0.0, 0.0, 0.1), study.Point("nrc", 1e-3, 1.0, 0.001),
+                  *(study.Point("nirc", c, 100 * c, 0.01) for c in (0.0, 1e-3, 1e-2))]  # fmt: skip
+        found = {"scene": scene, "points": [], "factors": study.factors(points), "environment": ENVIRONMENT}
+        (tmp_path / scene).mkdir()
+        (tmp_path / scene / "results.json").write_text(json.dumps(found), encoding="utf-8")
+    table = of(results, "path_lengths")
+    results.fill(table, results.collected(tmp_path, "*/results.json", "factors"), "abc1234", None)
+    nrc = [["0.00", "0.1"], ["1.00", "0.001"], ["0.50", "1.00"]]
+    assert table["rows"][0][2:] == [["0.000", "0.01"], *nrc, ""]
+    assert table["rows"][2][2:] == [["1.000", "0.01"], *nrc, ["0.5", "1"]]
+
+
+def test_what_a_plan_saves_is_read(results, tmp_path):
+    """As `studies/ablation.py` writes it, several scenes a file."""
+    study, table = load_study("ablation"), of(results, "plan")
+    modes = (study.EVERYTHING, study.PLANNED, study.EQUAL_TIME)
+    parts = {"wide": table["extract"]["rows"][1:7], "square": [table["extract"]["rows"][k] for k in (0, 7)]}
+    for folder, rows in parts.items():
+        estimates = [{mode: study.Estimate(k + 0.1 * n, 0.0) for n, mode in enumerate(modes)} for k in (1, 2)]
+        found = [study.asdict(study.Result(row["scene"], "nirc", {modes[0]: 273.6, modes[1]: 187.2},
+                                           study.Estimate(1.634, 0.346), {}, *estimates, {}, ["reliability"]))
+                 for row in rows]  # fmt: skip
+        (tmp_path / folder).mkdir()
+        text = json.dumps({"arguments": {}, "rows": found, "environment": ENVIRONMENT})
+        (tmp_path / folder / "ablation.json").write_text(text, encoding="utf-8")
+    before = results.tables.rows(results.tables.read("plan"))[7]["cells"]
+    results.fill(table, results.collected(tmp_path, "*/ablation.json", "rows"), "abc1234", None)
+    assert table["rows"][7][:-1] == [
+        before[0], {"values": ["274", "187"], "as": "{} / {}"}, {"values": ["1.63", "0.35"], "as": "{} ± {}"},
+        ["1", "2.000"], ["1.1", "2.100"], ["1.2", "2.200"],
+    ]  # fmt: skip
+
+
+def test_efficiencies_of_the_study_are_read(results, tmp_path):
+    """As `studies/efficiency.py` writes them, a file a scene."""
+    table = of(results, "unbiased")
+    labels = [column["integrator"] for column in table["extract"]["columns"][1:]]
+    for row in table["extract"]["rows"]:
+        rows = [{"integrator": label, "efficiency": 0.234 + n, "statistics": {"split": "path tracing, 4 paths"}}
+                for n, label in enumerate(["path", *labels])]  # fmt: skip
+        text = json.dumps({"scene": row["scene"], "rows": rows, "environment": ENVIRONMENT})
+        (tmp_path / f"{row['scene']}.json").write_text(text, encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "*.json", "rows"), "abc1234", None)
+    assert table["rows"][6][1:] == [f"{n + 0.23:.2f}" for n in range(1, 10)]
+
+
+def test_what_a_frame_costs_is_read(results, tmp_path):
+    """As `studies/frame_profile.py` writes it, one record a file; what was measured before stays."""
+    study, table = load_study("frame_profile"), results.tables.read("frame_cost")
+    before = [row["cells"][:2] for row in results.tables.rows(table)]
+    found = {
+        "frame": {"spp": 1, "total": 0.05, "train": 0.02, "query": 0.01, "trace": 0.01, "film": 0.0005,
+                  "python": 0.0095},
+        "memory": 293.2, "query": 43.44, "network": {"ns": 50.7, "gflops": 80.0, "blas_same_shape_gflops": 100.0,
+                                                     "blas_square_gflops": 200.0},
+        "training": dict.fromkeys(("total", "records", "network", "products", "optimiser", "python",
+                                   "us_per_record_step", "us_per_record"), 2.04),
+        "first_image": {name: {"first": 9.1, "done": 12.2} for name in ("cold", "warm")},
+    }  # fmt: skip
+    for width in (320, 1920):
+        row = {"scene": "ajar_door", "width": width, "shown": study.shown(found), **found, "environment": ENVIRONMENT}
+        if width == 1920:
+            del row["first_image"]
+        (tmp_path / f"{width}.json").write_text(json.dumps(row), encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "*.json", "."), "abc1234", None)
+    assert [row[:2] for row in table["rows"]] == before
+    texts = results.tables._cells(table, [row[2] for row in table["rows"]])
+    assert texts[0] == "50.0 ms: train 40 %, query 20 %, trace 20 %, film 1.0 %, Python and launches 19.0 % (9.5 ms)"
+    assert texts[2] == "2.04 us in the step, 2.04 us with its tracing"
+    assert texts[4] == "50.7 ns, 80 GFLOP/s: 80 % of NumPy's product of its shape (100), 40 % of a large one (200)"
+    assert texts[5] == "9.1 / 9.1 s; the finished one after 12.2 / 12.2 s"
+    assert texts[6] == "293 MiB; 293 MiB at 1920x1080"
 
 
 def test_a_sequence_is_read(results, tmp_path):

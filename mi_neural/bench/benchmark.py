@@ -1,15 +1,15 @@
 """Speed against error: several integrators, equal time, one reference.
 
-Kinds of rows, each raw and, if asked, denoised:
+Kinds of rows, each raw and, with ``--denoise``, also denoised:
 
-one-shot   a cache starts from nothing; S seconds from the moment kernels are compiled, training included. The
-           denoiser's time is reported apart and not part of S.
+one-shot   a cache starts empty; S seconds, counted from when kernels are compiled, training included. The denoiser's
+           time is reported separately and is not part of S.
 steady     a cache has been trained for a number of frames before the clock starts; then frames of equal total time. For
            a denoised frame the denoiser's time is part of it, so that fewer samples are taken.
 sample     frames of one sample a pixel, in the same steady state: median time and mean error.
 split      where the time of such a frame goes (:mod:`.split`).
 curve      the image of the longest one-shot run after 1, 2, 4, ... samples a pixel, as it stood then: relMSE alone,
-           since FLIP takes longer than many a sample.
+           since FLIP takes longer to compute than many samples take to render.
 
 All of it is repeated with seeds that share nothing, for the training as well, so that the rows of one kind are
 independent. The peak of memory is that of the process since its integrator was compiled.
@@ -39,15 +39,15 @@ from .reference import Reference
 #: Frames that a steady row averages over, and those of a sample row.
 STEADY_FRAMES = 4
 SAMPLE_FRAMES = 5
-#: Kinds of rows that are numbers alone.
+#: Kinds of rows without a picture.
 WITHOUT_PICTURE = ("curve", "split")
-#: Between the seeds of repeats; frames of one repeat count on from its own.
+#: Distance between the seeds of two repeats; the frames of a repeat use the seeds that follow its own.
 SEED_STEP = 10_000
 
 
 @dataclass
 class Row:
-    """One line of a table: what was rendered, what it cost, what it is worth. Times in seconds, of one frame.
+    """One line of a table: what was rendered, its time and its error. Times in seconds, of one frame.
 
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
     of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind, `spp` of an image made
@@ -138,8 +138,8 @@ class Plan:
 class Bench:
     """Measures integrators on one scene against one reference; hand each finished picture to `on_picture`.
 
-    Ctrl-C: the rendering under way is finished early, its row is marked, and ``KeyboardInterrupt`` is raised after it.
-    What `kept` holds (a :class:`~mi_neural.bench.kept.Kept`) is not measured again.
+    After Ctrl-C the current rendering is finished early, its row is marked, and ``KeyboardInterrupt`` is raised after
+    it. What `kept` holds (a :class:`~mi_neural.bench.kept.Kept`) is not measured again.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class Bench:
                     self.compile(case, plan.seed)
                     compiled = True
                 measure()
-            case.integrator = None  # what it holds shall not count as the next one's memory
+            case.integrator = None  # its memory must not count as the next one's
 
     def recall(self, case: Case, plan: Plan) -> bool:
         """Hand over all rows of a case if none is left to be measured; returns whether that is so."""
@@ -208,7 +208,8 @@ class Bench:
         case.seconds_compile = budget.warm_up(scene, case.integrator, budget.pass_sizes(scene), seed)
 
     def one_shot(self, case: Case, seconds: float, plan: Plan, repeat: int) -> None:
-        """From an empty cache to an image in `seconds`; of the longest also how the error fell."""
+        """Render from an empty cache within `seconds`; for the longest budget, record the error after 1, 2, 4, ...
+        samples too."""
         seed = self._begin(case, plan, repeat)
         progress = self._progress(f"{_name(case, plan, repeat)}: {seconds:g} s")
         stages: list[Rendered] = []
@@ -235,7 +236,7 @@ class Bench:
             facts |= {"pretrain_frames": plan.steady_frames, "seconds_pretrain": pretrain}
 
         pass_times: dict[int, float] = {}
-        # A frame for nothing: what is made once per trained state shall not count as the cost of a frame
+        # This frame is thrown away: what is made once per trained state must not count as the cost of a frame
         for size in budget.pass_sizes(scene):
             frame = budget.render_samples(scene, integrator, size, seed + 1000)
             if frame.interrupted:
@@ -397,7 +398,7 @@ def make_cases(
     loaded: LoadedScene, specs: list[IntegratorSpec], optional: dict[str, object] | None = None, denoise: bool = False
 ) -> list[Case]:
     """Build the integrators with the scene's own depth; with `denoise` for images that will be denoised, where they
-    know the difference.
+    have settings of their own for that.
 
     `optional` keys go to every integrator that knows them; one that none knows is an error.
     """

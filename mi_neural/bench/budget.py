@@ -1,9 +1,9 @@
-"""Rendering to a number of samples or within a time, in passes, with honest clocks.
+"""Rendering to a number of samples or within a time, in passes.
 
 Dr.Jit works asynchronously: the clock is read after ``dr.sync_thread()`` only. Kernels are compiled before it starts
-(:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; what an integrator
-with a cache can do beyond Mitsuba's own is looked up by name: `train`, `train_seconds`, `train_first`,
-`train_fraction`, `prepare`, `plan_samples`, `statistics`, `reset`, `reseed`.
+(:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; methods that
+Mitsuba's own integrators lack are looked up by name: `train`, `train_seconds`, `train_first`, `train_fraction`,
+`prepare`, `plan_samples`, `statistics`, `reset`, `reseed`.
 
 Ctrl-C ends a rendering early and keeps what has been rendered; the result says so. During training it ends the
 training, and one pass is rendered with what has been learned.
@@ -26,8 +26,8 @@ Progress = Callable[[float, float], None]
 
 #: Samples a pixel that one pass under a time budget may have. Few and fixed, so that each can be compiled beforehand.
 PASS_SPP = (1, 4, 16, 64)
-#: Longest planned pass in seconds: what a Ctrl-C may have to wait for. Longer passes pay Mitsuba's cost per call less
-#: often.
+#: Longest planned pass in seconds; a Ctrl-C may have to wait for so long. Longer passes pay Mitsuba's cost per call
+#: less often.
 PASS_SECONDS = 1.0
 #: Most samples in one pass. 2^21 paths need less than 1 GiB in every scene measured.
 PASS_SAMPLES = 2**21
@@ -46,10 +46,10 @@ class Rendered:
     channels         what else the integrator shows, by name, each of shape (height, width)
     spp              samples a pixel actually taken
     nonfinite        pixels of single passes that were left out because they held a NaN or an infinity
-    seconds_train    wall time in training, also in such as happens inside of the first render call
+    seconds_train    wall time in training, also in training that happens inside of the first render call
     seconds_render   wall time in rendering without it
-    statistics       what the integrator says about itself, {} for Mitsuba's own
-    interrupted      it ended early: by Ctrl-C, or by what `problem` says in one line
+    statistics       what the integrator's `statistics` returns, {} for Mitsuba's own
+    interrupted      whether it ended early: by Ctrl-C, or for the reason that `problem` gives in one line
     """
 
     rgb: np.ndarray
@@ -83,8 +83,8 @@ def clock() -> float:
 def render_pass(scene, integrator, spp: int, seed: int, sensor: int = 0) -> np.ndarray:
     """One developed film as an array of shape (height, width, channels).
 
-    What ``mi.render`` does without gradients. That function itself turns every exception into a ``RuntimeError`` of its
-    own, Ctrl-C and an integrator's message to the user included.
+    It does what ``mi.render`` does without gradients. That function turns every exception into a ``RuntimeError`` of
+    its own, also Ctrl-C and an integrator's message to the user.
     """
     import drjit as dr
 
@@ -124,7 +124,8 @@ def pass_sizes(scene, sensor: int = 0) -> list[int]:
 def warm_up(scene, integrator, spps: list[int], seed: int = 0, sensor: int = 0) -> float:
     """Compile every kernel that rendering with these samples a pixel needs; returns the seconds it took.
 
-    An integrator with `prepare` does it without a trace in its state; for others a render is thrown away.
+    An integrator with `prepare` does it without a change of its state; for others one image is rendered and thrown
+    away.
     """
     start = clock()
     for index, spp in enumerate(spps):
@@ -164,8 +165,8 @@ def train_first(scene, integrator, sensor: int = 0, progress: Progress | None = 
 
 
 def preview(scene, integrator, seed: int = 0, sensor: int = 0) -> Rendered | None:
-    """One sample a pixel with what has been learned so far, the integrator going on as if it had not been asked. None
-    for one that has nothing to learn or whose images grow from call to call."""
+    """One sample a pixel with what has been learned so far; the integrator's state does not change. None for one that
+    learns nothing or whose images grow from call to call."""
     if not hasattr(integrator, "previewing") or getattr(integrator, "cumulative", False):
         return None
     run = _Run(scene, integrator, seed, sensor, None)
@@ -291,13 +292,13 @@ def render_until(
     progress: Progress | None = None, keep: Callable[[Rendered], None] | None = None,
 ) -> tuple[Rendered, ErrorEstimate | None]:  # fmt: skip
     """Render until the estimated trimmed relMSE is at most `error`, or for `seconds` if that comes first. Returns the
-    image and the estimate, which knows of noise and not of bias (:class:`~mi_neural.image.moments.Groups`).
+    image and the estimate, which contains noise and not bias (:class:`~mi_neural.image.moments.Groups`).
 
-    An integrator that says how noisy tracing is (`noise_of_pairs`) is asked for an image of so many samples that
-    tracing alone would have this error: then its bias may not pass for little noise.
+    An integrator that measures the noise of tracing (`noise_of_pairs`) plans an image of so many samples that tracing
+    alone would have this error. Otherwise it could accept a bias that the estimate does not contain.
 
-    Between two looks at the error there are nine tenths of the samples that seem to be missing, at most as many as
-    there are already.
+    The error is estimated again after nine tenths of the samples that seem to be missing, at most as many as there are
+    already.
     """
     start, film, estimate, needed = clock(), Groups(), None, 4.0
     run = _Run(scene, integrator, seed, sensor, keep, 0, film)
@@ -326,8 +327,8 @@ def render_until(
 def choose_pass(sizes: list[int], times: dict[int, float], remaining: float) -> int | None:
     """The largest pass that should end within `remaining` seconds, the smallest if half of it fits, else None.
 
-    A size not yet timed is expected to cost as much a sample as the nearest one that was, which errs on the long side
-    for larger passes.
+    A size not yet timed is expected to cost as much a sample as the nearest one that was timed, which errs on the long
+    side for larger passes.
     """
     if not times:
         return sizes[0] if remaining > 0.0 else None

@@ -1,8 +1,8 @@
 """One parameter of a scene as a function of the frame: finding it, computing its values, setting them.
 
-Parameters are those of ``mi.traverse(scene)``, and two more that are natural and missing there:
+Parameters are those of ``mi.traverse(scene)``, and two more:
 
-``SHAPE.to_world``   of a mesh: a 4x4 matrix applied to where the mesh was when the scene was loaded. Its original value
+``SHAPE.to_world``   of a mesh: a 4x4 matrix applied to the mesh as it was when the scene was loaded. Its original value
                      is the identity, so that ``translate(0, 1, 0) @ value`` lifts a mesh as it does a sphere
 ``LIGHT.direction``  of a directional or spot light: the unit vector in which its light travels
 
@@ -68,7 +68,7 @@ class MeshPlacement(Parameter):
         )
 
     def set(self, value: np.ndarray) -> None:
-        moved = not np.array_equal(value, np.eye(4))  # the identity gives back the very numbers
+        moved = not np.array_equal(value, np.eye(4))  # the identity returns exactly the same numbers
         positions = self.positions @ value[:3, :3].T + value[:3, 3] if moved else self.positions
         _assign(self.params, f"{self.shape}.vertex_positions", positions.ravel())
         if self.normals.size:
@@ -123,7 +123,8 @@ def keys(params) -> dict[str, Callable[[], Parameter]]:
 
 
 def of_sensors(scene, names) -> bool:
-    """Whether the parameters of these names all belong to sensors, so that joined meshes and materials do no harm."""
+    """Whether the parameters of these names all belong to sensors, so that joined meshes and materials do not
+    matter."""
     import mitsuba as mi
 
     params = mi.traverse(scene)
@@ -172,7 +173,7 @@ def _numbers(key: str, value: object) -> np.ndarray:
 
     if isinstance(value, (bool, int, float)):
         return np.array(float(value))
-    if dr.is_array_v(value):  # asked first: Dr.Jit takes `.matrix` of a colour for a swizzle
+    if dr.is_array_v(value):  # tested first: Dr.Jit reads `.matrix` of a colour as a swizzle
         numbers = np.array(value, np.float64)
         if dr.is_tensor_v(value) or numbers.size == 0:
             return numbers
@@ -308,7 +309,7 @@ def expression(key: str, text: str, frames: int, change_at: int | None = None) -
     s       frames since then, at least 0
 
     with the names of `FUNCTIONS`, and ``bitmap("file_%04d.exr")`` for the image of this frame. Nothing else can be
-    named, so that a text from elsewhere does no harm. Raises :class:`InputError`.
+    named, so that a text from an unknown source can do no harm. Raises :class:`InputError`.
     """
     where = f"--change {key}={text}"
     try:
@@ -358,7 +359,7 @@ def parse(texts: list[str], frames: int, change_at: int | None = None) -> dict[s
 
 
 class _FloatPowers(ast.NodeTransformer):
-    """``a ** b`` in floating point: whole numbers of any length could take for ever."""
+    """``a ** b`` in floating point: integers of any length could take unlimited time."""
 
     def visit_BinOp(self, node):
         self.generic_visit(node)
@@ -374,7 +375,8 @@ def _power(base, exponent):
 def bitmap(pattern: str, frame: int, shape: tuple[int, ...]) -> np.ndarray:
     """The image `pattern % frame` as linear values in the shape (height, width, channels) of a texture.
 
-    An environment map holds its last and first column once more, before and after the others; an image gets them.
+    An environment map repeats its last column before the first and its first column after the last; they are added to
+    an image that lacks them.
     """
     import mitsuba as mi
 

@@ -1,6 +1,6 @@
 """Beyond one machine: jobs on the workers of a Dask scheduler, and images put together from parts.
 
-    dask scheduler                                  # on one machine; says its address
+    dask scheduler                                  # on one machine; prints its address
     dask worker tcp://HOST:8786 --nthreads 8        # on each machine, with mi_neural installed
 
     from mi_neural.bench import cluster
@@ -39,20 +39,20 @@ from mi_neural.image.moments import Moments
 from . import benchmark, budget, environment, jobs, sequence
 from .load import InputError, LoadedScene, load_scene, one_line, parse_integrator, split_channels
 
-#: Fewest passes of an image, as far as it has samples: their spread says what the variance is.
+#: Fewest passes of an image that has so many samples: the variance is estimated from their spread.
 LEAST_PASSES = 16
 #: Parts of an image for each worker. More share the work more evenly, fewer send less.
 PARTS_PER_WORKER = 8
 #: Seconds to wait for the scheduler's answer, and for a worker where there is none (any more).
 CONNECT_SECONDS, PATIENCE = 10.0, 60.0
-#: Seconds between two looks at who is there, and that an answer may take to be sent.
+#: Seconds between two checks which workers are there, and the most that an answer may take to be sent.
 LOOK_SECONDS, FETCH_SECONDS = 1.0, 300.0
-#: Workers that a job may lose before it is taken to be the reason.
+#: Workers that a job may lose; with one more, the job is taken to be the reason.
 LOSSES = 3
 
 
 class ClusterError(InputError):
-    """The cluster cannot do what it is asked; the message is one line and complete."""
+    """The cluster cannot do what was requested; the message is one line and complete."""
 
 
 class JobError(ClusterError):
@@ -74,7 +74,7 @@ class Answer:
 
 @cache
 def _renderer(threads: int) -> ThreadPoolExecutor:
-    """The one thread of a worker process that ever meets Mitsuba: jobs queue up, however many Dask hands out."""
+    """The only thread of a worker process that calls Mitsuba: jobs queue up, however many Dask hands out."""
     import drjit as dr
 
     return ThreadPoolExecutor(1, "mi_neural", dr.set_thread_count, (threads,))
@@ -103,8 +103,8 @@ def work(job, packed: bytes | None = None) -> Answer:
 
 
 def _by_value() -> Callable:
-    """A function that calls what was pickled. Being nested it is sent as code: the scheduler looks into each task, and
-    would import a function of ours, and Mitsuba with it."""
+    """A function that calls what was pickled. It is nested and therefore sent as code: the scheduler unpickles each
+    task, and would import this package, and Mitsuba with it, for a function of a module."""
 
     def call(packed: bytes, *data):
         import pickle
@@ -140,7 +140,7 @@ def connect(client, patience: float = PATIENCE):
         yield Workers(client, patience)
         return
     try:
-        # First, since a Client cannot be made of nonsense and then be forgotten
+        # First, since a Client of an address that makes no sense cannot be discarded
         address = distributed.comm.normalize_address(client)
         distributed.comm.get_address_host_port(address, strict=True)
         made = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
@@ -179,8 +179,9 @@ class Workers:
         """Run jobs, each with its data (None: without; one object is sent once, for however many jobs).
 
         Yields (index, answer) as they are done, in any order; a job that failed gives its error. A job whose worker
-        dies is given to another. Whoever stops listening, by an exception or otherwise, cancels what has not begun.
-        Raises :class:`ClusterError`: a job lost several workers, no worker or no scheduler is there any more.
+        dies is given to another. If the caller stops iterating, by an exception or otherwise, jobs that have not begun
+        are cancelled. Raises :class:`ClusterError`: a job lost several workers, no worker or no scheduler is there any
+        more.
         """
         waiting, finished, call = deque(range(len(jobs_and_data))), queue.SimpleQueue(), _by_value()
         running: dict[object, tuple[int, str]] = {}  # future -> job, worker
@@ -203,7 +204,7 @@ class Workers:
                     future.add_done_callback(finished.put)
 
         def lost(index: int, name: str) -> None:
-            # Not left to Dask: with workers to choose from it may put two jobs on one, told which one it waits for that
+            # The worker is named: if Dask chooses among workers, it may put two jobs on one of them
             losses[index] += 1
             if losses[index] > LOSSES:
                 raise ClusterError(
@@ -239,14 +240,15 @@ class Workers:
                 self.client.cancel(list(running), force=True)
 
     def run(self, jobs_and_data: list[tuple[object, object]]) -> Iterator[tuple[int, Answer]]:
-        """As :meth:`map`, for jobs that are nothing without one another: the first that fails ends all."""
+        """As :meth:`map`, for jobs that are of use only together: the first that fails ends all."""
         for index, answer in self.map(jobs_and_data):
             if isinstance(answer, JobError):
                 raise answer
             yield index, answer
 
     def _send(self, data):
-        """Data as a future. A task and not scattered: it is made anew where all workers that held it are gone."""
+        """Data as a future. It is the result of a task, which Dask repeats where all workers that held it are gone;
+        scattered data would be lost."""
         import dask
 
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "4 GiB"}):
@@ -255,8 +257,9 @@ class Workers:
     def _fetch(self, future, name: str) -> Answer | JobError | None:
         """The answer of a job that is done, from the worker `name`; None where that has died since.
 
-        Dask waits for the answer of a dead worker as for one that takes long to be sent. So the worker is looked for
-        after one look's time, and after twice as long each time, as an interrupted answer is sent anew.
+        Dask does not tell a dead worker from an answer that takes long to be sent. So this checks whether the worker is
+        there after LOOK_SECONDS, and then after twice as long each time, since an answer that was interrupted is sent
+        from the beginning.
         """
         distributed = _distributed()
         if not future.done():
@@ -322,7 +325,7 @@ def plan_parts(setup: jobs.Setup, passes: list[int], n_parts: int, seed: int) ->
 
 
 def check(case: benchmark.Case, over_time: bool = False) -> None:
-    """Raise :class:`ClusterError` where parts of an image (`over_time`: frames) cannot be rendered apart."""
+    """Raise :class:`ClusterError` where parts of an image (`over_time`: frames) cannot be rendered separately."""
     integrator, name = case.integrator, case.spec.type
     if getattr(integrator, "cumulative", False):
         raise ClusterError(f"{name} makes its image of all samples together (mode=progressive): leave the mode out")

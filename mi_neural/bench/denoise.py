@@ -1,7 +1,7 @@
 """The denoiser in a comparison: its guides, and the time that it takes.
 
 The guides (:mod:`mi_neural.bench.guides`) are the same for all integrators of a comparison, so that none has a better
-denoiser than another. Their time is reported apart and belongs to no integrator.
+denoiser than another. Their time is reported separately and counts for no integrator.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Images that other renderers made, as rows of a comparison: their time is what the user says, their error is measured
-as that of every other row."""
+"""Images that other renderers made, as rows of a comparison: the user gives their time, and their error is measured as
+that of every other row."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FORM = "--image takes NAME=FILE.exr,seconds=T and, where wanted, spp=N, denoised
 
 @dataclass(frozen=True)
 class Image:
-    """A file and what is said of it.
+    """An image file and what the user says of it.
 
     label     its name in tables
     path      an EXR file, linear RGB of the film's size, or a whole number of times as large
@@ -58,7 +58,7 @@ def parse(text: str) -> Image:
 
 
 def of_scene(images: list[Image], name: str) -> list[Image]:
-    """Those that show this scene."""
+    """The images that show this scene."""
     return [image for image in images if image.scene in (None, name)]
 
 

@@ -42,7 +42,7 @@ def cores() -> int:
 
 
 def processor() -> str:
-    """The processor's name as its maker writes it; of other systems, what Python reports."""
+    """The processor's name as its maker writes it; on other systems than Linux, what Python reports."""
     if sys.platform == "linux":
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

@@ -1,8 +1,9 @@
 """Getting public scenes: from their address, a mirror, a folder or an archive on this machine.
 
-What is in the folder of the scenes is whole: a scene is unpacked beside it and then moved there. An archive that was
-fetched in part is kept, and the same call goes on from there if the server can and its file has not changed. Archives
-are checked against the checksum in the catalogue; where none is known, against the one that was found at first.
+The folder of the scenes holds complete scenes only: a scene is unpacked beside it and then moved there. An archive that
+was fetched in part is kept, and the same call goes on from there if the server can and its file has not changed.
+Archives are checked against the checksum in the catalogue; where none is known, against the one that was found the
+first time.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def get(name: str, source: str | None = None, progress: Progress | None = None, 
         new = check(name, scene, sha256, accept)
         _install(name, scene, source or scene.url, lambda new: unpack(archive, new), sha256)
     except InputError:
-        if fetched:  # whole, but not what it should be: going on from it would not help
+        if fetched:  # complete, but not the right file: continuing it would not help
             _forget(archive)
         raise
     remember(name, sha256, source or scene.url)
@@ -150,7 +151,7 @@ def download(url: str, part: Path, progress: Progress | None = None) -> Path:
     try:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=SILENCE) as answer:
             sent = answer.headers.get("Content-Range", "")
-            start = start if answer.status == 206 and sent.startswith(f"bytes {start}-") else 0  # else all of it comes
+            start = start if answer.status == 206 and sent.startswith(f"bytes {start}-") else 0  # else it sends all
             tag = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
             _write(state, {"url": url, "tag": None if tag and tag.startswith("W/") else tag})
             length = answer.headers.get("Content-Length")
@@ -270,7 +271,7 @@ def _refuse_large(archive: Path, size: int) -> None:
 def _install(
     name: str, scene: public.Public, source, fill: Callable[[Path], object], sha256: str | None = None
 ) -> None:  # fmt: skip
-    """Have `fill` write the scene into a folder beside its place, look at it, and move it there."""
+    """Have `fill` write the scene into a folder beside its place, check it, and move it there."""
     with _temporary(public.folder()) as new:
         fill(new)
         root = _root(new, scene)
@@ -296,7 +297,7 @@ def _root(folder: Path, scene: public.Public) -> Path | None:
 
 @contextlib.contextmanager
 def _temporary(parent: Path):
-    """A folder that is gone afterwards, whatever happens."""
+    """A folder that is removed afterwards, also after an error."""
     folder = Path(tempfile.mkdtemp(prefix=".new-", dir=parent))
     folder.chmod(0o755)
     try:

@@ -24,7 +24,7 @@ from .page import flip_colours
 from .report import number
 from .sequence import frame_path
 
-#: Frames a second of animations; what WebP may lose of them and of sheets (100: nothing).
+#: Frames a second of animations; quality of WebP for them and for sheets (100: best).
 RATE, MOVING_QUALITY, SHEET_QUALITY = 12, 60, 85
 #: Pictures side by side on a sheet.
 PER_ROW = 4

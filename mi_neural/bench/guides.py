@@ -1,6 +1,6 @@
 """Guides of the denoiser: what each pixel shows, without its light.
 
-They are albedo and shading normal of the first surface with a smooth lobe. Mirrors, glass and null surfaces are
+The guides are albedo and shading normal of the first surface with a smooth lobe. Mirrors, glass and null surfaces are
 followed up to there, so that a reflection is as sharp as what it shows, and the albedo is that of all lobes together
 (:func:`~mi_neural.render.surface.surface_of`), so that metal is not black. Their noise is filtered before they are
 used.
@@ -63,7 +63,7 @@ def denoise(image, scene, sensor: int | mi.Sensor = 0, seed: int = 0) -> mi.Tens
 def guides(scene, sensor: int | mi.Sensor = 0, seed: int = 0) -> Guides:
     """The denoiser's guides of a view of `scene`, through the film and reconstruction filter of the sensor."""
     camera = sensor if isinstance(sensor, mi.Sensor) else scene.sensors()[sensor]
-    n_samples = camera.sampler().sample_count()  # of renderings without `spp`; Mitsuba would leave ours there
+    n_samples = camera.sampler().sample_count()  # restored below; Mitsuba would keep ours for later renderings
     with dr.suspend_grad():
         image = _integrator().render(scene, camera, seed=seed, spp=GUIDE_SPP, develop=True, evaluate=False)
         values = np.nan_to_num(np.array(image)[..., -6:].astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)

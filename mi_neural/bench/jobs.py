@@ -133,7 +133,7 @@ class Workbench:
         same_scene = same_scene and setup == replace(self.of_scene, spec=setup.spec, keys=setup.keys)
         self.setup = self.of_scene = self.case = self.cache = None
         if not same_scene:
-            # Gone before the next one is loaded: all emitters that are alive are compiled into every kernel
+            # Released before the next one is loaded: all emitters that are alive are compiled into every kernel
             self.loaded = self.sequence = self.sequence_key = None
         gc.collect()
         mi.set_variant(setup.variant)
@@ -153,9 +153,9 @@ class Workbench:
         return self.loaded, self.case
 
     def learned(self, cache: bytes | None, over_time: Sequence | None = None) -> None:
-        """Give the integrator the cache of those bytes, for good: it does not train any more.
+        """Load the cache of those bytes into the integrator, which does not train any more after that.
 
-        It is bound to the scene in the state of frame 0 of `over_time`, as it did where it was trained.
+        It is bound to the scene in the state of frame 0 of `over_time`, as it was where it was trained.
         """
         integrator = self.case.integrator
         if hasattr(integrator, "freeze_cache"):
@@ -261,7 +261,7 @@ class Measurement:
         if guides is not None:
             denoise.require()
         loaded, case = workbench.ready(self.setup, fresh=True)
-        workbench.setup = None  # the bench trains the integrator, and lets go of it
+        workbench.setup = None  # the bench trains the integrator, and releases it
         pictures: list[benchmark.Picture] = []
         bench = benchmark.Bench(loaded, reference, guides, environment.describe(), pictures.append)
         bench.run([case], self.plan)

@@ -1,4 +1,4 @@
-"""What an unfinished comparison has measured, on disk, so that the same command goes on from there.
+"""Rows that an unfinished comparison has measured, kept on disk, so that the same command goes on from there.
 
 `rows.jsonl` holds the settings and then a line for each row, written as soon as its image is. It is removed at the end:
 a finished comparison is measured anew.
@@ -55,7 +55,7 @@ class Kept:
         exr.write_text(self.path, json.dumps({"settings": settings}) + "\n" + "".join(map(_line, self.rows.values())))
 
     def add(self, row: Row) -> None:
-        """Remember a row, whose image, if it has one, is written. One that was remembered before is nothing new."""
+        """Remember a row, whose image, if it has one, is written. A row that is kept already is not written again."""
         if self.rows.get(_key(row)) is row:
             return
         self.rows[_key(row)] = row
@@ -86,7 +86,7 @@ class Kept:
         return found
 
     def finish(self) -> None:
-        """All is done and reported."""
+        """Remove the file: all is done and reported."""
         self.path.unlink(missing_ok=True)
 
 

@@ -122,8 +122,9 @@ def load_scene(
     path = find_scene(name)
     parameters = {k: str(v) for k, v in (parameters or {}).items()}
     config = mi.parser.ParserConfig(mi.variant())
-    # Threads would number the scene's parts in another order each time, and no kernel of the last process would fit:
-    # with OptiX ten seconds. What takes long, hierarchies and large files, is no slower
+    # Not in parallel: threads would number the scene's parts in another order each time, and no cached kernel of an
+    # earlier process would match, which costs ten seconds with OptiX. What takes long, acceleration structures and
+    # large files, is no slower
     config.parallel = False
 
     def parse():
@@ -152,7 +153,7 @@ def load_scene(
                 raise
             merge = False
             state, own = parse()
-            scene = make(state)  # fails alike where the merging was not why
+            scene = make(state)  # fails in the same way where merging was not the reason
 
     if not isinstance(scene, mi.Scene):
         raise InputError(f"{path} is no scene: its outermost element must be <scene>")

@@ -1,4 +1,4 @@
-"""Peak memory of this process, counted anew for each thing that is measured."""
+"""Peak memory of this process, counted from zero for each integrator that is measured."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ _PROCESS = Path("/proc/self")
 
 
 def start() -> bool:
-    """Give back what Dr.Jit holds in reserve and count the peak from here on; False where the system cannot."""
+    """Free the memory that Dr.Jit keeps for later use, and count the peak from here on; False where the system
+    cannot."""
     import drjit as dr
 
     dr.sync_thread()

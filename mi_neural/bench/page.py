@@ -1,5 +1,5 @@
-"""One self-contained HTML page of a comparison. Each scene opens with what is seen at once: pictures side by side,
-which are zoomed together, and one plot of the error over time. Tables and more curves follow.
+"""One self-contained HTML page of a comparison. Each scene begins with pictures side by side, which are zoomed
+together, and one plot of the error over time. Tables and more curves follow.
 
 The page holds everything: pictures as data URLs, curves as inline SVG, style and script inline. It loads nothing.
 """
@@ -34,9 +34,9 @@ from .report import (
 
 #: What the modes of rows mean, in the order in which a page shows them.
 MODE_TEXT = {
-    "one-shot": "One image from nothing: wall time from compiled kernels, training included",
-    "sample": "One-sample frames of a running sequence, trained before",
-    "steady": "Frames of a running sequence at equal time, trained before; the denoiser's time is part of the frame",
+    "one-shot": "One image, from an empty cache: wall time after kernels are compiled, training included",
+    "sample": "Frames of one sample in a running sequence, with a cache that was trained before",
+    "steady": "Frames of equal time, denoising included, in a running sequence, with a cache that was trained before",
 }
 #: Modes whose errors are drawn together, by the name of the drawing.
 CURVES = {"one-shot": ("one-shot",), "unfinished": ("curve",), "steady": ("sample", "steady")}
@@ -190,8 +190,9 @@ def _wide(cells: list[list[str]], marked: set[tuple[int, int]] = frozenset()) ->
 def _summary(report: Report) -> str:
     parts = [
         '<section id="summary"><h2>Summary</h2>',
-        "<p>Trimmed relMSE / FLIP. Factor: by how much trimmed relMSE is below that of the first integrator, denoised "
-        "or not as in this line; geometric mean over the scenes. The least error of a column is marked.</p>",
+        "<p>Trimmed relMSE / FLIP. The factor is the trimmed relMSE of the first integrator, denoised or not as in "
+        "this line, over that of this line (geometric mean over the scenes). The least error of a column is "
+        "marked.</p>",
     ]
     for title, cells in summary(report):
         parts.append(f"<h3>{html.escape(title)}</h3>{_wide(cells, best_of_summary(cells))}")
@@ -202,8 +203,8 @@ def _scene(scene: SceneResult, k: int, drawn: dict[str, str]) -> str:
     parts = [f'<section id="scene-{k}"><h2>{html.escape(scene.name)}, {scene.size[0]}x{scene.size[1]}</h2>']
     if scene.entries:
         parts.append(
-            f'<div class="viewer" id="viewer-{k}"></div><p class="about">Click a picture, then: wheel or double-click '
-            "zooms, dragging moves, all pictures follow.</p>"
+            f'<div class="viewer" id="viewer-{k}"></div><p class="about">Click a picture first. Then the wheel or a '
+            "double-click zooms, and dragging moves; all pictures follow.</p>"
         )
     if overview := curves.overview(scene.rows):
         parts.append(f'<h3>Error over time</h3><div class="curves overview">{overview}</div>')
@@ -213,9 +214,9 @@ def _scene(scene: SceneResult, k: int, drawn: dict[str, str]) -> str:
             parts.append(f"<h3>{html.escape(text)}</h3>{_wide(table(of_mode), best(of_mode))}")
     if frames := split_table(scene.groups):
         parts.append(
-            "<h3>Where the time of a one-sample frame goes, in ms</h3>" + _wide(frames) + '<p class="about">'
-            "Kernels by Dr.Jit's own clocks; one fused kernel holds queries and tracing, so queries are their number "
-            "times what one costs in a kernel of its own. Python: wall time in which no kernel runs.</p>"
+            "<h3>Parts of the time of a one-sample frame, in ms</h3>" + _wide(frames) + '<p class="about">'
+            "Dr.Jit times the kernels. One fused kernel holds queries and tracing, so the time of queries is their "
+            "number times what one costs in a kernel of its own. Python: wall time in which no kernel runs.</p>"
         )
     for kind, svg in drawn.items():
         parts.append(f'<h3>{html.escape(CURVE_TEXT[kind])}</h3><div class="curves">{svg}</div>')

@@ -1,4 +1,4 @@
-"""What a sequence looks like: table, curves, crops, an animated preview, and one self-contained page.
+"""Results of a sequence: table, curves, crops, an animated preview, and one self-contained page.
 
 Curves over the frame show FLIP, frame-to-frame SMAPE and mean reliability; crops show two regions, the one that the
 change alters most and the one that it alters least, with error maps (as Figures 1, 4 and 5 of the paper on
@@ -25,7 +25,7 @@ from .page import flip_colours
 from .page import style as page_style
 from .sequence import Result, Run
 
-#: Frames after a change that count as the first response, and frames after it from which all should have settled.
+#: Frames after a change that count as the first response, and frames after it from which errors should be stable again.
 FIRST, LATE = 10, 25
 #: Statistics whose names contain one of these are drawn over the frames; channels, shown as maps from red to green.
 RELIABILITY = ("reliab", "sigma", "prefer", "blend")
@@ -246,7 +246,7 @@ def shown_frames(frames: int, change: int | None) -> list[int]:
 
 
 def pictures_of(found: Found, frame: int) -> np.ndarray:
-    """The picture that stands for the truth at a frame: the reference, or the first case's frame without one."""
+    """The picture that others are compared with at a frame: the reference, or without one the first case's frame."""
     if found.run.references is not None:
         return found.run.references.of(frame).rgb
     return found.results[0].image(frame).rgb

@@ -56,12 +56,13 @@ class Reference:
         return float(relative_squared_errors(self.rgb, self.rgb, self.variance)[1].mean())
 
     def standard_error(self) -> float | None:
-        """Relative standard error of a pixel, the root mean square over the image: :meth:`noise_floor`'s root."""
+        """Relative standard error of a pixel, as the root mean square over the image: the square root of
+        :meth:`noise_floor`."""
         noise = self.noise_floor()
         return None if noise is None else noise**0.5
 
     def averaged(self, size: tuple[int, int]) -> Reference:
-        """This one for a film of `size`, (width, height), k times smaller: means of k x k pixels, whose noise is
+        """This reference for a film of `size`, (width, height), k times smaller: means of k x k pixels, whose noise is
         independent."""
         scale = self.rgb.shape[1] // size[0]
         variance = self.variance
@@ -83,8 +84,8 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None, scaled
     """Read a reference and check it against the size (width, height) that will be rendered.
 
     With `scaled` it may also be k times as large, k a whole number, and is then averaged over k x k pixels; or k times
-    smaller: it stays so, and whoever compares averages the image (:func:`.metrics.block_means`). Right for films with a
-    box filter alone, whose pixels are such means.
+    smaller: it is then returned as it is, and the caller averages the image (:func:`.metrics.block_means`). Both are
+    right only for films with a box filter, whose pixels are such means.
 
     Raises :class:`InputError` where the file is missing or no EXR, has another size, or holds NaN or infinities.
     """

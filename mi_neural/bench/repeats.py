@@ -1,7 +1,8 @@
-"""Repeats taken together: means with confidence intervals, bias and variance apart.
+"""Statistics over repeats: means with confidence intervals, and bias and variance as separate numbers.
 
 Intervals are Student's t of level 95 % for the mean of independent repeats. They hold for means of values that are
-about normal; of errors with rare outliers a few repeats see few, and the interval is then too narrow.
+about normally distributed. If errors have rare outliers, a few repeats contain too few of them, and the interval is too
+narrow.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ def half_width(values: Iterable[float]) -> float | None:
 
 @dataclass
 class Group:
-    """Rows that differ by their repeat alone, never none, and what follows from their images together.
+    """Rows that differ in their repeat alone, at least one, and what follows from all their images.
 
     `squared_bias` and `variance` are those of one image, relative as in relMSE and trimmed alike; `squared_bias_error`
-    is the first one's standard error: by the jackknife over the repeats, and of the reference as if its noise were
-    normal. None: fewer than two repeats (the error: three), no reference.
+    is the standard error of the first: by the jackknife over the repeats, and for the reference as if its noise were
+    normally distributed. None: fewer than two repeats (the error: three), no reference.
     """
 
     rows: list[Row]

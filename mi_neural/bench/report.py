@@ -114,7 +114,7 @@ def best_of_summary(cells: list[list[str]]) -> set[tuple[int, int]]:
 
 
 def split_table(groups: Iterable[Group]) -> list[list[str]]:
-    """Where the time of a one-sample frame goes, in milliseconds and parts of it; empty without such rows."""
+    """Where the time of a one-sample frame goes, in milliseconds and per cent; empty without such rows."""
     lines = []
     for g in groups:
         found = [row.split for row in g.rows if row.split]
@@ -250,7 +250,7 @@ def _rounded(value: float | None) -> int | None:
 
 
 def number(value: float | int | None) -> str:
-    """Three significant digits, no exponent where it can be helped, empty for None."""
+    """Three significant digits, no exponent where it can be avoided, empty for None."""
     if value is None:
         return ""
     if value == 0 or isinstance(value, int) or float(value).is_integer():

@@ -1,10 +1,11 @@
-"""Dynamic scenes: parameters that change from frame to frame, and what each frame is then worth.
+"""Dynamic scenes: parameters that change from frame to frame, and the error of each frame.
 
-:class:`Sequence` sets a scene to the state of a frame; :class:`References` holds one reference for each state;
-:class:`Run` renders the frames of one integrator after another, measures them, and goes on where it was interrupted.
+:class:`Sequence` sets a scene to the state of a frame; :class:`References` holds one reference for each state (both
+:mod:`.timeline`); :class:`Run` renders the frames of one integrator after another, measures them, and goes on where it
+was interrupted, from the files of :mod:`.sequence_files`.
 
 A frame is what ``mi.render`` makes of the state at that frame: an integrator with a cache trains its `train_steps`
-first, and carries over what it knows from the frames before. Kernels are compiled before the first frame.
+first, and keeps what it has learned from the frames before. Kernels are compiled before the first frame.
 
 Per frame: seconds (training and rendering), HDR-FLIP, relMSE, and SMAPE to the frame before. FLIP's exposures are the
 same for all frames: from the lowest start to the highest stop that FLIP chooses for any of the references. SMAPE at a
@@ -17,171 +18,23 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from math import ceil
 from pathlib import Path
 
 import numpy as np
 
 from mi_neural.image import exr, metrics
 
-from . import benchmark, budget, changes, denoise
-from . import reference as references
+from . import benchmark, budget, denoise
 from .benchmark import Case, plain
 from .budget import clock
 from .load import InputError, LoadedScene
+from .sequence_files import Keeper, frame_path, read_json, write_rows
+from .timeline import References, Sequence, check_frames
 
 #: Stream of random numbers of the frames; those below it belong to :mod:`budget`.
 STREAM_FRAMES = 16
-#: Frames of training between two looks at whether to save.
+#: Training frames between two checks whether to save.
 PRETRAIN_PART = 64
-#: Share of the time that saving a cache may take.
-KEEP_SHARE = 0.05
-
-# ------------------------------------------------------------------------------------------------------------------
-# The scene over time
-
-
-class Sequence:
-    """A scene whose parameters are functions of the frame.
-
-    functions  key -> function(frame, original value) -> new value of the same shape; see :mod:`changes` for keys and
-               shapes. A function must give the same for the same frame every time
-    frames     their number
-    change_at  frame of an abrupt change, where figures are told apart by it; default: the first frame unlike frame 0
-
-    All functions are called for all frames here, so that what is wrong is found before the first image: raises
-    :class:`InputError` for an unknown key, a function that fails or gives NaN or another shape (and says at which
-    frame), two changes of one parameter, no frames, a change after the end.
-
-    ``states[frame]`` is a hash of all values that are not the original ones, "" where none is.
-    """
-
-    def __init__(
-        self, scene, functions: dict[str, changes.Function], frames: int, change_at: int | None = None
-    ) -> None:
-        import mitsuba as mi
-
-        check_frames(frames, change_at)
-        self.frames, self.change_at = int(frames), change_at
-        self._params = mi.traverse(scene)
-        known = changes.keys(self._params)
-        self.parameters: list[changes.Parameter] = []
-        self._functions: list[changes.Function] = []
-        for key, function in functions.items():
-            self.parameters.append(known[changes.find_key(known, key)]())
-            self._functions.append(function)
-        self._check_distinct()
-
-        n = len(self.parameters)
-        originals = [changes.digest({p.key: p.value}) for p in self.parameters]
-        self._digests = [[""] * n for _ in range(self.frames)]  # "" stands for the original value
-        self.states = []
-        for frame in range(self.frames):
-            values = {}
-            for k, parameter in enumerate(self.parameters):
-                value = self._value(k, frame)
-                found = changes.digest({parameter.key: value})
-                if found != originals[k]:
-                    self._digests[frame][k] = found
-                    values[parameter.key] = value
-            self.states.append(changes.digest(values))
-
-        self._current = ["unset"] * n  # so that all are set once, and no later frame differs from frame 0 in kind
-        self.restore()
-
-    @property
-    def change(self) -> int | None:
-        """The frame that divides before from after: `change_at`, or the first frame unlike frame 0; None: none is."""
-        if self.change_at is not None:
-            return self.change_at
-        return next((k for k, state in enumerate(self.states) if state != self.states[0]), None)
-
-    def apply(self, frame: int) -> bool:
-        """Set the scene to the state of `frame`; returns whether anything had to be set."""
-        if not 0 <= frame < self.frames:
-            raise InputError(f"there is no frame {frame}: the sequence has frames 0 to {self.frames - 1}")
-        return self._set(self._digests[frame], lambda k: self._value(k, frame))
-
-    def restore(self) -> bool:
-        """Set all parameters to what they were; returns whether anything had to be set."""
-        return self._set([""] * len(self.parameters), lambda k: self.parameters[k].value)
-
-    def _set(self, digests: list[str], value: Callable[[int], np.ndarray]) -> bool:
-        stale = [k for k, digest in enumerate(digests) if digest != self._current[k]]
-        for k in stale:
-            self.parameters[k].set(self.parameters[k].value if not digests[k] else value(k))
-            self._current[k] = digests[k]
-        if stale:
-            self._params.update()  # rebuilds acceleration structures and emitter distributions
-        return bool(stale)
-
-    def _value(self, k: int, frame: int) -> np.ndarray:
-        parameter = self.parameters[k]
-        try:
-            return parameter.check(self._functions[k](frame, parameter.value.copy()))
-        except Exception as error:
-            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise InputError(f"the change of {parameter.key} at frame {frame}: {text}") from None
-
-    def _check_distinct(self) -> None:
-        touched: dict[str, str] = {}
-        for parameter in self.parameters:
-            owner, _, name = parameter.key.rpartition(".")
-            placement = name in ("to_world", "direction", "vertex_positions", "vertex_normals")
-            target = f"{owner} placement" if placement else parameter.key
-            if target in touched:
-                both = " and ".join(dict.fromkeys((touched[target], parameter.key)))
-                raise InputError(f"{both}: the same parameter is changed twice; give one change")
-            touched[target] = parameter.key
-
-
-def check_frames(frames: int, change_at: int | None) -> None:
-    """Raise :class:`InputError` for no frames, or for a change outside of them."""
-    if frames < 1:
-        raise InputError(f"--frames takes a number of frames from 1, got {frames}")
-    if change_at is not None and not 1 <= change_at < frames:
-        where = "is after the end" if change_at >= frames else "is not after the first frame"
-        raise InputError(f"--change-at {change_at} {where}: the frames are 0 to {frames - 1}, give 1 to {frames - 1}")
-
-
-class References:
-    """One reference for each state of a sequence, rendered once and kept in `folder`; see :mod:`reference`."""
-
-    def __init__(self, loaded: LoadedScene, sequence: Sequence, spp: int, folder: Path) -> None:
-        self.loaded, self.sequence, self.spp, self.folder = loaded, sequence, spp, folder
-        self.first = {state: frame for frame, state in reversed(list(enumerate(sequence.states)))}
-        self.exposures: metrics.FlipExposures | None = None
-        self._held: dict[str, references.Reference] = {}
-
-    def render(self, progress: Callable[[str], budget.Progress | None]) -> None:
-        """Render what is missing and choose FLIP's exposures; goes on with what an interruption left."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        found = []
-        for k, (state, frame) in enumerate(sorted(self.first.items(), key=lambda item: item[1])):
-            bar = progress(f"reference {k + 1} of {len(self.first)}, {self.spp} samples a pixel")
-            self.sequence.apply(frame)
-            made = references.render_reference(self.loaded, self.spp, self.folder, bar, state=state)
-            if made.rgb.max() > 0.0:
-                found.append(metrics.flip_exposures(made.rgb))
-        if found:
-            start, stop = min(e.start for e in found), max(e.stop for e in found)
-            self.exposures = metrics.FlipExposures(start, stop, max(2, ceil(stop - start)))
-        else:
-            self.exposures = metrics.FlipExposures(0.0, 0.0, 1)
-
-    def of(self, frame: int) -> references.Reference:
-        """The reference of a frame; the last two that were asked for are kept in memory."""
-        state = self.sequence.states[frame]
-        if state not in self._held:
-            path = references.reference_path(self.loaded, self.folder, state)
-            self._held = dict(list(self._held.items())[-1:])
-            self._held[state] = references.load_reference(path, self.loaded.size)
-        return self._held[state]
-
-
-# ------------------------------------------------------------------------------------------------------------------
-# Rendering it
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -214,11 +67,6 @@ class Result:
     def image(self, frame: int) -> exr.Image:
         """A frame that is done."""
         return exr.read(frame_path(self.folder, frame))
-
-
-def frame_path(folder: Path, frame: int) -> Path:
-    """The file of a frame."""
-    return folder / f"frame_{frame:04d}.exr"
 
 
 class Run:
@@ -301,20 +149,20 @@ class Run:
         if len(result.rows) >= self.sequence.frames:
             return result
 
-        # ---- In the state of frame 0, so that a cache file is met by the scene that it was begun in
+        # ---- In the state of frame 0, so that a cache file is loaded with the scene in which it was begun
         self.sequence.apply(0)
         if self.elsewhere is None:
             self.progress(f"{case.spec.label}: compiling")
             sizes = sorted(set(budget.plan_passes(scene, self.plan.spp)))
             case.seconds_compile = budget.warm_up(scene, integrator, sizes, self.plan.seed)
         elif hasattr(integrator, "train"):
-            integrator.train(scene, 0)  # it meets the scene, as it does in compiling
-        keeper = _Keeper(integrator, folder)
+            integrator.train(scene, 0)  # binds it to the scene, as compiling does
+        keeper = Keeper(integrator, folder)
         done = keeper.load(len(result.rows))
         del result.rows[0 if done is None else done :]
         result.facts["seconds_compile"] = case.seconds_compile
         self._write_settings(folder, settings, result.facts)
-        _write_rows(folder, result.rows)
+        write_rows(folder, result.rows)
         if done is None:
             budget.reset(integrator)
             result.facts.update(pretrained=0, seconds_pretrain=0.0)
@@ -345,7 +193,7 @@ class Run:
                 bar(frame + 1, self.sequence.frames)
         return result
 
-    def _pretrain(self, case: Case, keeper: _Keeper, result: Result, settings: dict[str, object]) -> None:
+    def _pretrain(self, case: Case, keeper: Keeper, result: Result, settings: dict[str, object]) -> None:
         """Train before the first frame, in parts that an interruption leaves done."""
         facts, total = result.facts, self.plan.pretrain
         if not hasattr(case.integrator, "train") or facts["pretrained"] >= total:
@@ -429,7 +277,7 @@ class Run:
         return plain(row), image
 
     def _guides_of(self, frame: int) -> denoise.Guides:
-        """The denoiser's guides for the state of a frame; their time belongs to nobody."""
+        """The denoiser's guides for the state of a frame; their time counts for no integrator."""
         state = self.sequence.states[frame]
         if self._guides is None or self._guides[0] != state:
             first = self._guides is None
@@ -464,7 +312,7 @@ class Run:
         return json.loads(json.dumps(plain(settings)))
 
     def _check_settings(self, folder: Path, settings: dict[str, object]) -> None:
-        kept = _read_json(folder / "sequence.json").get("settings")
+        kept = read_json(folder / "sequence.json").get("settings")
         for name in settings if kept is not None else ():
             if name in kept and kept[name] != settings[name]:
                 raise InputError(
@@ -473,7 +321,7 @@ class Run:
                 )
 
     def _facts(self, folder: Path) -> dict[str, object]:
-        return dict(_read_json(folder / "sequence.json").get("facts") or {})
+        return dict(read_json(folder / "sequence.json").get("facts") or {})
 
     def _write_settings(self, folder: Path, settings: dict[str, object], facts: dict[str, object]) -> None:
         exr.write_text(folder / "sequence.json", json.dumps({"settings": settings, "facts": facts}, indent=1) + "\n")
@@ -499,62 +347,6 @@ class Run:
         return rows
 
 
-class _Keeper:
-    """Cache files of one case: `cache_0012.npz` is the state after 12 frames. Saves as often as it costs little."""
-
-    def __init__(self, integrator, folder: Path) -> None:
-        self.integrator, self.folder = integrator, folder
-        self.able = hasattr(integrator, "save_cache") and hasattr(integrator, "load_cache")
-        self.cost, self.saved = 0.0, clock()
-        if self.able:
-            try:
-                with exr.replacing(folder / "cache_probe.npz") as probe:
-                    integrator.save_cache(str(probe))
-                (folder / "cache_probe.npz").unlink()
-            except RuntimeError:  # settings with which no cache is ever asked
-                self.able = False
-            self.cost, self.saved = clock() - self.saved, clock()
-
-    def load(self, n_done: int) -> int | None:
-        """Bring back the latest state that is not after `n_done` frames; returns after how many. None: begin anew."""
-        if not self.able:
-            return n_done or None
-        counts = [n for n in self._counts() if n <= n_done]
-        if not counts:
-            return None
-        self.integrator.load_cache(str(self._path(max(counts))))
-        return max(counts)
-
-    def due(self) -> bool:
-        """Whether saving now keeps its share of the time."""
-        return self.able and KEEP_SHARE * (clock() - self.saved) >= self.cost
-
-    def save(self, n_done: int) -> None:
-        """Keep the state after `n_done` frames, and no other."""
-        if not self.able:
-            return
-        start = clock()
-        self.integrator.save_cache(str(self._path(n_done)))
-        for n in self._counts():
-            if n != n_done:
-                self._path(n).unlink()
-        self.saved = clock()
-        self.cost = self.saved - start
-
-    def _path(self, n: int) -> Path:
-        return self.folder / f"cache_{n:04d}.npz"
-
-    def _counts(self) -> list[int]:
-        matches = (re.fullmatch(r"cache_(\d+)\.npz", p.name) for p in self.folder.iterdir())
-        return [int(m[1]) for m in matches if m]
-
-
-def _write_rows(folder: Path, rows: list[dict[str, object]]) -> None:
-    exr.write_text(folder / "frames.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
-
-
-def _read_json(path: Path) -> dict[str, object]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
+__all__ = [
+    "Frame", "Plan", "References", "Result", "Run", "Sequence", "check_frames", "frame_path",
+]  # fmt: skip

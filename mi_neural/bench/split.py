@@ -6,7 +6,7 @@ train    kernels of the training step: its wall time by the integrator's own clo
          that is taken alone
 film     developing the film and copying it to NumPy, done once more after the frame
 query    number of queries of an image x what one costs in a kernel of its own (`ns_per_query`). An estimate: one fused
-         kernel traces and queries, and no clock reads inside of it
+         kernel traces and queries, and no clock can be read inside of it
 trace    all other kernels of the image: camera rays, materials, lights, splats
 python   wall time in which no kernel runs: Python, Dr.Jit's own work, launches; of the training step too
 
@@ -86,7 +86,7 @@ def measure(scene, integrator, spp: int = 1, frames: int = FRAMES) -> Split:
         query = min(image, 1e-9 * queries * after.get("ns_per_query", 0.0))
         found.append((wall, train, query, image - query, develop, max(0.0, wall - train - image - develop)))
     total, train, query, trace, developed, python = (median(f[k] for f in found[WARM_FRAMES:]) for k in range(6))
-    # Medians of parts need not add up to the median of the whole; what is least sharply defined takes the difference
+    # Medians of parts need not add up to the median of the whole; the least exactly measured part takes the difference
     python = max(0.0, total - train - query - trace - developed)
     return Split(spp, total, train, query or None, trace, developed, python)
 

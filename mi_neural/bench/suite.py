@@ -1,4 +1,4 @@
-"""A comparison over several scenes: :mod:`.benchmark` on each, what is kept of each, and all of it in one report."""
+"""A comparison over several scenes: :mod:`.benchmark` on each, what is kept of each, and one report of all."""
 
 from __future__ import annotations
 

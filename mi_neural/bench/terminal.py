@@ -151,7 +151,7 @@ def stop_alike() -> None:
 
 
 def stopped_by() -> int:
-    """The signal that the program was told to stop by."""
+    """The signal that stopped the program."""
     return _stopped[-1] if _stopped else int(signal.SIGINT)
 
 

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: The box is enlarged by this share on each axis (METHODS: 15 %), so that points a little outside stay inside.
+#: The box is enlarged by this share on each axis, so that points a little outside stay inside.
 MARGIN = 0.15
 
 

@@ -1,4 +1,4 @@
-"""NVC: the neural visibility cache (the seed's light-sampling paper), and how it is trained.
+"""NVC: the neural visibility cache (Bokšanský and Meister 2025), and how it is trained.
 
 ``V(x)`` is the share of each light, or of each cluster of lights, that is visible from x: a hash grid and a small MLP
 with one output per light, learned from shadow rays while rendering. It depends on position alone.
@@ -28,7 +28,7 @@ from .voxels import Ages
 BATCH = 8
 #: To find a normal, rays start so far beside, as a share of their length; and the steepest surface, as a tangent.
 BESIDE, STEEPEST = 1e-3, 30.0
-#: What training lessens; the second is the seed's.
+#: Losses of training; the second is the published one.
 LOSSES = ("cross_entropy", "squared")
 
 #: Levels of the hash grid.

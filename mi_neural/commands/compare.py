@@ -41,11 +41,11 @@ def compare(
         typer.Option(metavar="S,S,...", help=f"budgets of a frame with --steady; default {DEFAULT_FRAME_SECONDS}"),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(metavar="N", help="do it all with N independent seeds: confidence intervals, bias, variance")
+        int, typer.Option(metavar="N", help="measure with N independent seeds: confidence intervals, bias, variance")
     ] = 1,
     size: Annotated[
         str | None,
-        typer.Option(metavar="WxH,...", help="size of the films; of several, each scene takes the nearest in shape"),
+        typer.Option(metavar="WxH,...", help="size of the films; each scene takes the one nearest in shape to its own"),
     ] = None,
     seed: options.Seed = 0,
     variant: options.Variant = terminal.DEFAULT_VARIANT,

@@ -22,7 +22,7 @@ Set = Annotated[
 Define = Annotated[
     list[str] | None, typer.Option("--define", "-D", metavar="NAME=VALUE", help="a $parameter of the scene")
 ]
-Size = Annotated[str | None, typer.Option(metavar="WxH", help="size of the film, whatever the scene says")]
+Size = Annotated[str | None, typer.Option(metavar="WxH", help="size of the film, in place of the scene's")]
 Seed = Annotated[int, typer.Option(min=0, help="same seed, same image")]
 Variant = Annotated[str, typer.Option(help="Mitsuba variant")]
 ReferenceFile = Annotated[

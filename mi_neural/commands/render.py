@@ -29,11 +29,11 @@ def render(
     define: options.Define = None,
     spp: Annotated[int | None, typer.Option(help="samples a pixel; default: what the scene says")] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="wall time instead of samples, training included, compiling not")
+        float | None, typer.Option(help="wall time instead of samples, with training, without compiling")
     ] = None,
     until_error: Annotated[
         float | None,
-        typer.Option(metavar="E", help="until the estimated trimmed relMSE, of noise alone, is E; at most --seconds"),
+        typer.Option(metavar="E", help="until the estimated trimmed relMSE (noise, not bias) is E; at most --seconds"),
     ] = None,
     pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before the clock starts")] = 0,
     size: options.Size = None,
@@ -115,7 +115,7 @@ def render(
         first_image = first_image or environment.seconds_since_start()
 
     def previewed(progress: budget.Progress) -> budget.Progress:
-        """`progress` of training, which also writes a first image once that has gone on for a while."""
+        """`progress` of training, which also writes a first image after some time of it."""
         start = budget.clock()
 
         def advance(done: float, total: float) -> None:
@@ -153,7 +153,7 @@ def render(
         if (seconds is None or until_error) and not stopped:
             bars_first = previewed(bars("training")) if hasattr(case.integrator, "train_first") else None
             seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
-        if stopped:  # the image that can be had at once
+        if stopped:  # the image that is there at once
             rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
             rendered.interrupted = True
         elif until_error is not None:

@@ -42,7 +42,7 @@ def combine(cache_sum, n_cache, residual_sum, n_traced, alpha):
 
 
 def best_split(var_cache: float, cost_cache: float, var_residual: float, cost_residual: float) -> float:
-    """``Nc/Nr = sqrt(Var_c c_r / (Var_r c_c))``: the split of least variance for its cost (METHODS 1).
+    """``Nc/Nr = sqrt(Var_c c_r / (Var_r c_c))``: the split of least variance ``Var_c/Nc + Var_r/Nr`` for its cost.
 
     Variances of one sample of either part, costs in any one unit. 0 where the cache part has no variance, infinity
     where the residual has none.

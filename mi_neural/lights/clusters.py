@@ -14,10 +14,10 @@ METHODS = ("auto", "kmeans", "emitter")
 class Groups:
     """A partition of a light table into at most `n_outputs` groups. A PyTree.
 
-    As a light of its own, each group has the columns of :func:`~mi_neural.lights.table.importance`, in a Python list
-    `kind`, and in arrays. `cell`: which groups are parts of the environment. `start`, `count`: its range in `member`,
-    the lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity, or
-    with `equal` the same for all), `cumulative` its running sum over `member`; `group_of` leads from light to group.
+    Like a light, each group has the columns of :func:`~mi_neural.lights.table.importance`: `kind` is a Python list, the
+    others are arrays. `cell`: which groups are parts of the environment. `start`, `count`: its range in `member`, the
+    lights sorted by group; `within` is the probability of a light in its group (proportional to its intensity, or with
+    `equal` the same for all), `cumulative` its running sum over `member`; `group_of` leads from light to group.
     `facts`: see the light table.
     """
 
@@ -43,7 +43,7 @@ class Groups:
         cumulative = np.cumsum(within[order])
         cumulative -= (cumulative[start] - within[order][start])[label[order]]
         cumulative[start + count - 1] = 1.0
-        # What is drawn is what the rounded sums say
+        # Lights are drawn by the rounded sums, so these decide their probabilities
         cumulative = np.maximum.accumulate(cumulative.astype(np.float32) + label[order].astype(np.float64))
         cumulative -= label[order]
         before = np.where(np.arange(len(order)) == start[label[order]], 0, np.concatenate([[0], cumulative[:-1]]))
@@ -89,10 +89,10 @@ def bounds(
     """Sets of lights, each as one light that gives at least what any of its members gives.
 
     `c`: columns of the lights, `label` (lights,) the set of each, of `n` sets of which none is empty, `intensity`
-    (lights,) what they count. The spheres are centred where the light comes from in the mean or, with `boxes`, on the
+    (lights,) their weights. The spheres are centred where the light comes from in the mean or, with `boxes`, on the
     middle of the set's box, which makes them smaller. Returns ``kind``, ``center``, ``radius``, ``axis``, ``cone``,
     ``intensity`` of the sets as :func:`~mi_neural.lights.table.importance` reads them, float64. A set of several kinds
-    has the last of them.
+    has the largest of them.
     """
     count, total = np.bincount(label, minlength=n), np.bincount(label, intensity, n)
     weight = np.where(total[label] > 0, intensity, 1.0)

@@ -1,7 +1,7 @@
-"""The entries of a light table: what is read off emitters, as NumPy columns.
+"""The entries of a light table: what is read from emitters, as NumPy columns.
 
-Meshes are looked at through a few vectorised calls, whatever their number; spheres, disks, cylinders and point lights
-are read from their parameters, 40 us each; any other emitter is known by samples of its light.
+Meshes are read by a few vectorised calls, whatever their number; spheres, disks, cylinders and point lights are read
+from their parameters, 40 us each; for any other emitter, samples of its light are taken.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ CYLINDERS = (CYLINDER, CYLINDER_INSIDE)
 
 #: Samples of an emitter's light or place that its entry is made from.
 PROBES = 16
-#: So few emitters are called one by one. A call through pointers is compiled for each emitter of the scene.
+#: Emitters are called one by one if they are at most so many. A call through pointers is compiled for each emitter of
+#: the scene.
 FEW = 4
-#: Textures whose `value` is what they are everywhere.
+#: Textures that have the same `value` everywhere.
 CONSTANT = ("UniformSpectrum", "SRGBReflectanceSpectrum", "RawConstantTexture")
 
 
@@ -62,7 +63,8 @@ def make_columns(scene, emitters, counts: np.ndarray, rng) -> dict[str, np.ndarr
 
 
 def _read(columns, row: int, emitter) -> bool:
-    """Fill in the entry of a point light, or of an area light that is a sphere, disk or cylinder; False: another one.
+    """Fill in the entry of a point light, or of an area light that is a sphere, disk or cylinder; False for another
+    emitter.
 
     Pictures on spheres and disks are left to Mitsuba, which samples the picture. On cylinders it does that wrong, and
     on stretched ones it takes the wrong area.
@@ -113,7 +115,7 @@ def _read_cylinder(columns, row: int, emitter, shape, known: dict) -> bool:
     center = M[:, 3] + 0.5 * M[:, 2]
     ends = np.cos(turn)[:, None] * M[:, 0] + np.sin(turn)[:, None] * M[:, 1] + 0.5 * M[:, 2]
     ends = np.concatenate([ends, ends - M[:, 2]])
-    # Normals of rays that meet it; those of its own sample_position() point the other way in a mirrored one
+    # Normals of rays that hit it; those of its own sample_position() point the other way in a mirrored one
     form = CYLINDER if (np.linalg.det(M[:, :3]) < 0) == shape.has_flipped_normals() else CYLINDER_INSIDE
     if known["radiance"] is None:
         si = dr.zeros(mi.SurfaceInteraction3f, PROBES**2)
@@ -187,7 +189,7 @@ def _look(columns, scene, emitters, rows: list[int], rng) -> None:
         lamp, bright = _look_at(columns, scene, batch, mine, u)
         lamps += lamp
         glow += bright
-    # A lamp that was dark in all directions looked at may be a narrow beam
+    # A lamp that was dark in all sampled directions may be a narrow beam
     least = 1e-3 * max([0.0, *glow, float(columns["intensity"].max())])
     for row, bright in zip(lamps, glow, strict=True):
         columns["intensity"][row] = bright if bright > 0 else least
@@ -210,7 +212,7 @@ def _look_at(columns, scene, rows: list[int], emitters: list, u) -> tuple[list, 
         lights, spread = dr.gather(mi.EmitterPtr, pointers, dr.repeat(dr.arange(mi.UInt32, m), k)), None
     active = mi.Bool(np.repeat(~unsampled, k)) if spread is None else mi.Bool(bool(~unsampled[0]))
 
-    # Where they are and what they give, seen from the middle of the scene
+    # Their position and their light, seen from the middle of the scene
     middle = np.array(scene.bbox().center(), np.float64).ravel()
     middle = middle if np.isfinite(middle).all() else np.zeros(3)
     u = mi.Point2f(np.tile(u, (m, 1)).T)
@@ -262,7 +264,8 @@ def _look_at(columns, scene, rows: list[int], emitters: list, u) -> tuple[list, 
 
 
 def _area(shape) -> float:
-    """Area of an emitter's shape; 0 where it has none, or cannot say: such a shape cannot be sampled either."""
+    """Area of an emitter's shape; 0 where it has none or does not implement it: such a shape cannot be sampled
+    either."""
     try:
         return float(np.array(shape.surface_area()).ravel()[0]) if shape is not None else 0.0
     except RuntimeError:
@@ -285,7 +288,7 @@ def _glow(lamps, places: np.ndarray) -> np.ndarray:
 
 
 def seen_from(p):
-    """An interaction that serves emitters as the point they are seen from."""
+    """An interaction at the point from which emitters are seen."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p, it.n = mi.Point3f(p), mi.Normal3f(0, 0, 1)
     return at_probes(it)
@@ -304,7 +307,7 @@ def interaction(shape, prim, uv, ray, active):
 
 
 def _meshes(columns, scene, counts, is_mesh, rng) -> None:
-    """Fill in the entries of meshes, a triangle each."""
+    """Fill in the entries of meshes, one for each triangle."""
     emitters = scene.emitters_dr()
     shapes = emitters.get_shape()
     emitter, prim = columns["emitter"], columns["prim"]

@@ -1,7 +1,7 @@
 """Area lights whose light Mitsuba 3.9.1 loses or invents in next-event estimation (`path`, `direct`).
 
-Its error is measured against BSDF sampling alone (``direct`` with ``emitter_samples=0``). The light table samples all
-of these by the area of their surface, and is right.
+Errors are measured against BSDF sampling alone (``direct`` with ``emitter_samples=0``). The light table samples all of
+these by the area of their surface, which is exact.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import parameters
 
-#: A shading normal is bent whose cosine to that of its face is smaller.
+#: A shading normal counts as bent where its cosine to the normal of its face is smaller.
 BENT = 1 - 1e-4
 
 
@@ -22,8 +22,8 @@ def inexact(emitter) -> str:
       ``cube``. One ``rectangle`` is right.
     - The colours of a mesh attribute are read at the first face: -100 %.
     - The density of a point of a mesh is taken from its shading normal: -22 to +17 % where that is bent.
-    - A rotation about an axis of another length than 1 is none, and Mitsuba's inverse of it is not its inverse: normals
-      of a rectangle are bent, and rays meet another disk or cylinder than is sampled. -3 % and more.
+    - With an axis whose length is not 1, a rotation is no rotation, and the inverse that Mitsuba computes is not its
+      inverse: normals of a rectangle are bent, and rays hit another disk or cylinder than is sampled. -3 % and more.
     - Points of a picture on a cylinder are sought along rays, some of which miss: -1 to -4 %. Of a stretched cylinder
       the area is wrong: -5 to +37 %. A mirrored one shines inwards: -100 %.
     """

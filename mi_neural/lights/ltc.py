@@ -150,7 +150,7 @@ def entries(q, alpha, cos_theta):
 def table():
     """The fitted table for the current variant: a flat Float of 8 numbers a cell (q11, q22, q13, a, b, zeros).
 
-    Loaded at the first call for a variant. What is frozen (``dr.freeze``) must be given it as an argument.
+    Loaded at the first call for a variant. A function that is frozen (``dr.freeze``) needs it as an argument.
     """
     if mi.variant() not in _tables:
         with np.load(FILE) as file:
@@ -194,9 +194,9 @@ def reflected(shape, diffuse, f0, lobe: Lobe | None, integrate=integrate_polygon
     `shape`: what `integrate` takes (the vertices of a polygon, or a disk's centre and axes). `diffuse`: albedo of the
     Lambert lobe; `f0`: Fresnel reflectance at the normal; each Float or Color3f. `lobe` None: Lambert only.
     Measured against GGX, over the largest value: 0.2 to 4 % in the mean, 1 to 11 % for nine polygons in ten; more where
-    near lights meet grazing views (cos θ = 0.2: up to a third). A weight to sample with, not an image to show.
-    Both terms see the light from either side: leave out lights that do not emit towards the origin.
-    Heitz et al. 2016, section 5 (with a Schlick term in the albedo alone: the lobe's shape is that of Fresnel = 1).
+    near lights meet grazing views (cos θ = 0.2: up to a third). It is good enough as a weight for sampling, but not as
+    an image. Both terms see the light from either side: leave out lights that do not emit towards the origin. Heitz et
+    al. 2016, section 5 (with a Schlick term in the albedo alone: the lobe's shape is that of Fresnel = 1).
     """
     value = diffuse * integrate(shape)
     if lobe is not None:

@@ -1,11 +1,11 @@
 """How a light is chosen: one interface, four ways.
 
 ``choose(si, n, transmits, u, sampler, hit, active)`` draws a light for the surface point `si` with normal `n` (a mask
-says whether light from behind counts) by the uniform number `u`, and what more it needs from `sampler`, which comes
-back advanced, in the choice. With it comes the probability of light `hit`. ``pmf(si, n, transmits, index, active)`` is
-that probability alone. In scenes with participating media both have the mask `around` besides: it names the points in a
-medium, which receive light from all directions alike. Each light that can contribute keeps a positive probability, so
-every estimate made with any of them is unbiased: E[contribution(light) weight] = sum of all lights' contributions.
+says whether light from behind counts) by the uniform number `u` and further numbers of `sampler`; the choice holds the
+advanced sampler and the probability of light `hit`. ``pmf(si, n, transmits, index, active)`` is that probability alone.
+In scenes with participating media both have the mask `around` besides: it names the points in a medium, which receive
+light from all directions alike. Each light that can contribute keeps a positive probability, so every estimate made
+with any of them is unbiased: E[contribution(light) weight] = sum of all lights' contributions.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from . import tree
 from .clusters import Groups
 from .table import DIRECTION, ENVIRONMENT, LOCAL, LightTable, importance, own
 
-#: Predicted visibilities below this count as this. In a hall with 32 lights the seed's 0.001 gave fireflies where the
-#: network is wrong: relMSE 2.1 (trimmed 0.09); 0.03: 0.17 (0.10); 0.06: 0.13 (0.10).
+#: Predicted visibilities below this count as this. In a hall with 32 lights the published 0.001 gave fireflies where
+#: the network is wrong: relMSE 2.1 (trimmed 0.09); 0.03: 0.17 (0.10); 0.06: 0.13 (0.10).
 VISIBILITY_FLOOR = 0.06
-#: The same of parts of the environment: BSDF sampling finds what the network misses, and most parts are hidden indoors.
-#: Living room, direct light: variance 4.4 with the environment as one light, 3.8 with 0.06, 3.2 with 0.005.
+#: The same for parts of the environment: BSDF sampling finds what the network misses, and most parts are hidden
+#: indoors. Living room, direct light: variance 4.4 with the environment as one light, 3.8 with 0.06, 3.2 with 0.005.
 CELL_FLOOR = 0.005
 
 
 @dataclass
 class Choice:
-    """What was chosen.
+    """A chosen light.
 
     index    the light
-    weight   what its contribution counts: 1 / pmf, or the weight of a resampled candidate, whose mean that is
+    weight   factor of its contribution: 1 / pmf, or the weight of a resampled candidate, whose expected value is 1 /
+             pmf
     pmf      probability of the light, for MIS weights (with resampling: of it as a candidate)
-    pmf_hit  the same of the light `hit`; None where it is `pmf` that finds it, for lanes that need it alone
+    pmf_hit  the same of the light `hit`; None where the method `pmf` computes it, for the lanes alone that need it
     sampler  the sampler that was given, advanced by what was drawn; None where nothing was
     """
 
@@ -169,9 +170,9 @@ class TreeLights:
 class VisibleLights:
     """Lights in proportion to what they would give the point without shadows, times their predicted visibility.
 
-    All groups are looked at; where a group has several lights, one of `candidates` of them is resampled by what it
-    would give (RIS; Talbot et al. 2005). Without `field` visibility is taken to be 1. Predictions count as at least
-    `floor`. With `visibility_alone` what groups of several lights would give does not count (the paper's choice).
+    All groups are compared; where a group has several lights, one of `candidates` of them is resampled by what it would
+    give (RIS; Talbot et al. 2005). Without `field` visibility is taken to be 1. Predictions count as at least `floor`.
+    With `visibility_alone` groups of several lights are weighted by visibility alone (as published).
     """
 
     DRJIT_STRUCT = {"table": object, "groups": object, "field": object, "n_candidates": object, "facts": object}  # noqa: RUF012

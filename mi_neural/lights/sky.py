@@ -15,11 +15,11 @@ from ..render.spectrum import as_three, at_probes
 
 #: Texels a side, at least and at most. The most are 6 million bytes a hundred texels a side, and 0.4 degrees a texel.
 SIZES = (32, 512)
-#: Looks at the environment that texels' shares are estimated from, half of them where it samples itself.
+#: Samples of the environment that texels' shares are estimated from, half of them by its own sampling.
 LOOKS = 2**20
 #: Points of a texel lie within this angle of its centre, over R (measured: 3.54; see the tests).
 REACH = 4.0
-#: A texel that looked dark counts as this share of the mean, so that nothing bright is left out.
+#: A texel whose samples were dark counts as this share of the mean, so that nothing bright is left out.
 DARK = 1e-3
 
 
@@ -66,7 +66,7 @@ class Sky:
         self.distance = float(2 * np.linalg.norm(extent)) if np.isfinite(extent).all() and extent.any() else 2.0
         n = self.size**2
 
-        # Stratified looks at every texel, and the environment's own samples, which find what is small and bright
+        # Stratified samples of every texel, and the environment's own samples, which find what is small and bright
         side = max(1, int((LOOKS / n) ** 0.5))
         k = side**2
         lane = dr.arange(mi.UInt32, n * k)

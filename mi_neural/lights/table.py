@@ -48,16 +48,16 @@ class LightTable:
 
     emitter   index into the scene's emitters
     form      how the entry is sampled: TRIANGLE, PARALLELOGRAM, DISK, CYLINDER (CYLINDER_INSIDE: light leaves inwards):
-              uniformly by area; SPHERE: uniformly by solid angle; POINT; OTHER: as its emitter does, texels of the
-              environment apart; UNSAMPLED: shapes that Mitsuba cannot sample, whose light BSDF samples alone find
+              uniformly by area; SPHERE: uniformly by solid angle; POINT; OTHER: as its emitter does, except texels of
+              the environment; UNSAMPLED: shapes that Mitsuba cannot sample, whose light BSDF samples alone find
     corner, edge1, edge2, normal   of planes: points ``corner + u edge1 + v edge2``, with u + v <= 1 in a triangle and
               u² + v² <= 1 in a disk; unit normal, on the emitting side. Of cylinders ``corner + cos φ edge1 + sin φ
               edge2 + z normal``
     prim      primitive of the emitter's shape
     area      of what is sampled by area, and of spheres; 0 elsewhere
     radiance  mean emitted radiance of all these, intensity of points
-    plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is; nowhere but in
-              RGB variants
+    plain     radiance and normal are constant over the entry, so that `radiance` can be used as it is; only in RGB
+              variants
     kind      LOCAL, DIRECTION or ENVIRONMENT (as a whole; its texels are of kind DIRECTION)
     center, radius   bounding sphere of a LOCAL entry; DIRECTION: `center` is the direction towards the light
     axis, cone       mean normal, and cosine of the largest angle of a normal to it; -1: light leaves in all directions.
@@ -134,7 +134,7 @@ class LightTable:
     # -------------------------------------------------------------------------------------------------------------
 
     def index_of(self, scene, si, active=True):
-        """Entry that a ray met at `si`, the environment included, and whether what was met emits (else any entry)."""
+        """Entry that a ray hit at `si`, the environment included, and whether what was hit emits (else any entry)."""
         emitter = si.emitter(scene, active)
         number = dr.reinterpret_array(mi.UInt32, emitter)
         emits = active & (number > 0)
@@ -144,7 +144,7 @@ class LightTable:
         return first + stride * dr.select(si.is_valid(), si.prim_index, beyond), emits
 
     def emitted(self, scene, si, index, active):
-        """Radiance towards ``-si.wi`` of light `index`, which a ray met at `si`."""
+        """Radiance towards ``-si.wi`` of light `index`, which a ray hit at `si`."""
         if self.sky is not None or self._has(OTHER, UNSAMPLED) or not self.all_plain:
             return dr.select(active, si.emitter(scene, active).eval(si, active), 0)
         front = active & (mi.Frame3f.cos_theta(si.wi) > 0)
@@ -321,8 +321,8 @@ class LightTable:
         return dr.select(active, pdf, 0)
 
     def shadow_ray(self, scene, p, index, sample, active):
-        """A ray from the points `p` to a random point of light `index`, for a visibility test: as it is sampled, on its
-        back as well. Not normalised by what the point may receive."""
+        """A ray from the points `p` to a random point of light `index`, for a visibility test: as it is sampled, also
+        on its back. Not normalised by what the point may receive."""
         form = self._form(index, active)
         it = seen_from(p)
         target = mi.Point3f(dr.gather(mi.Vector3f, self.center, index, active))
@@ -353,7 +353,8 @@ def _by_area(form):
 
 def _cone(to_center, radius):
     """Of the cone that a sphere fills: (distance of the centre, squared sine and one minus cosine of the cone's angle,
-    whether it is seen from outside). No difference of near numbers is taken, as of the cosine of a small angle."""
+    whether it is seen from outside). Computed without the difference of nearly equal numbers, which the cosine of a
+    small angle would need."""
     d2 = dr.squared_norm(to_center)
     outside = d2 > dr.square(radius * (1 + mi.math.RayEpsilon))
     sin2 = dr.minimum(dr.square(radius) / dr.maximum(d2, 1e-30), 1)
@@ -361,7 +362,7 @@ def _cone(to_center, radius):
 
 
 def _surface(p, normal, uv, d, distance):
-    """The surface at `p` as a ray along `d` would meet it."""
+    """The surface at `p` as a ray along `d` would hit it."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.p, si.n, si.uv, si.t = p, mi.Normal3f(normal), uv, distance
     si.sh_frame = mi.Frame3f(si.n)
@@ -370,15 +371,15 @@ def _surface(p, normal, uv, d, distance):
 
 
 def own(values):
-    """A copy in memory of Dr.Jit's own. NumPy's is aligned by chance, and for each pattern of what is aligned in its
-    arguments a frozen function is recorded anew."""
+    """A copy in memory of Dr.Jit's own. The alignment of NumPy's arrays varies, and a frozen function is recorded anew
+    for each combination of aligned and unaligned arguments."""
     scalar = type(values) if dr.depth_v(values) == 1 else dr.value_t(type(values))
     dr.make_opaque(values)  # no literals, which would be compiled
     return values ^ dr.opaque(scalar, False) if dr.is_mask_v(values) else values + dr.opaque(scalar, 0)
 
 
 def importance(light, x, n, two_sided, around=None):
-    """Bound on what a surface at x with normal n receives of a light without shadows, up to a constant of order one.
+    """Bound on what a surface at x with normal n receives from a light without shadows, up to a constant of order one.
 
     `light` has the columns kind, center, radius, axis, cone, intensity, for one light each lane. Positive wherever any
     point of the light can be seen: angles are widened by the bounding sphere's (Conty Estevez and Kulla 2018, eq. 3).

@@ -10,8 +10,8 @@ normals. That cone is not bounded here but estimated, which changes the shape of
 mean R of the lights' axes, since normals that fill a cone evenly have R = (1 + cos θ) / 2. What nodes are *sampled* by
 is bounded: sphere and cone of :func:`~mi_neural.lights.clusters.bounds`.
 
-Lights at infinity have no place. They hang in a tree of their own beside the local ones, by direction in the place of
-position, and the environment as a whole beside them: the first choice is between near and far.
+Lights at infinity have no place. They have a tree of their own beside that of the local ones, with directions instead
+of positions, and the environment as a whole lies beside them: the first choice is between near and far.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ HALVES_FROM = 40
 CHUNK = 2**14
 #: Bounds are this much larger than computed, for what rounding to single precision takes away.
 SLACK = 1e-5
-#: Of a light whose radiance is known from a few samples, power counts as at least this share of the mean light's: it
-#: may have looked dark and have a bright part.
+#: Of a light whose radiance is known from a few samples, power counts as at least this share of the mean light's: its
+#: samples may have missed a bright part.
 UNCERTAIN = 0.1
 
 

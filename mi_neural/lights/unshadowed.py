@@ -30,12 +30,12 @@ from .table import ENVIRONMENT, LOCAL, LightTable
 TRIANGLE, PARALLELOGRAM, DISK, SPHERE, DELTA, OTHER, SKY = range(7)
 #: Materials whose lobes are known, by the names of their classes.
 KNOWN = ("SmoothDiffuse", "SmoothPlastic", "RoughPlastic", "RoughConductor")
-#: A Beckmann lobe is taken for a GGX lobe of so many times its alpha: least error against Monte Carlo (0.28 in the mean
-#: at alpha 0.2 under a light of 45 degrees; 0.42 for equal alphas).
+#: A Beckmann lobe is treated as a GGX lobe of so many times its alpha: least error against Monte Carlo (0.28 in the
+#: mean at alpha 0.2 under a light of 45 degrees; 0.42 for equal alphas).
 BECKMANN = 0.7
 #: Cosine at which the Fresnel loss of a Lambert lobe under a coat is taken; see `Receiver.albedo`.
 GRAZING = 0.3
-#: Where on a light of the kind OTHER it is looked at.
+#: Points of a light of the kind OTHER that are evaluated.
 POINTS = tuple((0.25 * i + 0.125, 0.25 * j + 0.125) for i in range(4) for j in range(4))
 #: Directions from which the environment's harmonics are made.
 SKY_SAMPLES = 2**15
@@ -75,7 +75,7 @@ class Receiver:
 class UnshadowedLights:
     """Unshadowed reflected radiance of the lights of `table` in `scene`.
 
-    ``receive`` looks at a surface, ``radiance`` at one light from it, ``total`` sums over all of them. No randomness,
+    ``receive`` evaluates a surface, ``radiance`` one light from it, and ``total`` sums over all of them. No randomness,
     no rays. `refresh` takes over roughnesses that were changed in the scene; for changed lights there is a new table,
     hence a new object.
     """
@@ -126,11 +126,11 @@ class UnshadowedLights:
     # -------------------------------------------------------------------------------------------------------------
 
     def receive(self, si, bsdf, active) -> Receiver:
-        """The lobes at `si`: albedos from the BSDF itself, so that textures and Fresnel terms are those it has."""
+        """The lobes at `si`: albedos are evaluated from the BSDF itself, with its textures and Fresnel terms."""
         number = dr.reinterpret_array(mi.UInt32, bsdf)
         known = mi.Bool(False)
         if self.materials.any_known:
-            # Materials inside instances cannot be looked at and have no entry
+            # Materials inside instances cannot be read and have no entry
             listed = active & (number < len(self.materials.known))
             known = listed & dr.gather(mi.Bool, self.is_known, number, listed)
         side = dr.mulsign(mi.Float(1), si.wi.z)
@@ -216,7 +216,7 @@ class UnshadowedLights:
     # -------------------------------------------------------------------------------------------------------------
 
     def _polygon(self, form: int, index, x, active):
-        """Corners of the light as it looks from x, its radiance, and whether it emits towards x."""
+        """Corners of the light as seen from x, its radiance, and whether it emits towards x."""
         t = self.table
         take = lambda a: dr.gather(mi.Vector3f, a, index, active)  # noqa: E731
         x = mi.Vector3f(x)
