@@ -136,6 +136,17 @@ def test_training_step_and_queries_are_found(monkeypatch):
     assert found.python > 0.04 and found.total > 0.05
 
 
+def test_training_that_is_queued_counts_as_training():
+    """Most of a small image's time: a step of 2048 paths against 192 samples."""
+    loaded = load.load_scene("cornell_box", (16, 12))
+    integrator, _ = load.build_integrator(load.parse_integrator("nrc"), loaded.carried)
+    integrator.train(loaded.scene, 16)
+    found = split.measure(loaded.scene, integrator, 1, frames=3)
+    alone = split.kernels(lambda: integrator.train(loaded.scene, 1))[1]
+    print(f"training {1e3 * found.train:.2f} ms, tracing {1e3 * found.trace:.2f}; a step alone {1e3 * alone:.2f}")
+    assert found.train > found.trace and found.train > 0.3 * alone
+
+
 # ---------------------------------------------------------------- memory
 
 

@@ -2,8 +2,8 @@
 
 Frames of a trained cache, with Dr.Jit's kernel history, which times each kernel by itself; medians over a few frames.
 
-train    kernels of the training step: its wall time by the integrator's own clock, times the share of kernels in a step
-         that is taken alone
+train    kernels of the training steps, each as long as one that is taken alone: in a frame they are queued and not
+         waited for, so that the integrator's own clock does not see them
 film     developing the film and copying it to NumPy, done once more after the frame
 query    number of queries of an image x what one costs in a kernel of its own (`ns_per_query`). An estimate: one fused
          kernel traces and queries, and no clock can be read inside of it
@@ -75,12 +75,11 @@ def measure(scene, integrator, spp: int = 1, frames: int = FRAMES) -> Split:
         wall, busy = kernels(lambda seed=seed: budget.render_pass(scene, integrator, spp, seed))
         after = budget.statistics(integrator)
         develop, develop_busy = kernels(lambda: np.array(film.develop()))
-        trained = min(wall, after.get("seconds_train", 0.0) - before.get("seconds_train", 0.0))
+        gone = {name: after.get(name, 0) - before.get(name, 0) for name in ("steps", "seconds_train")}
         train = 0.0
-        if trained > 0.0:
-            step, step_busy = kernels(lambda: integrator.train(scene, 1))
-            train = min(busy, trained * step_busy / step)
-        develop = min(develop, wall - trained)
+        if any(v > 0 for v in gone.values()):  # a light sampler counts no steps
+            train = min(busy, max(gone["steps"], 1) * kernels(lambda: integrator.train(scene, 1))[1])
+        develop = min(develop, wall - train)
         image = max(0.0, busy - train - min(develop_busy, develop))
         queries = after.get("queries", 0) - before.get("queries", 0)
         query = min(image, 1e-9 * queries * after.get("ns_per_query", 0.0))
