@@ -243,6 +243,14 @@ def test_scenes_are_merged_unless_they_cannot_be(tmp_path):
     assert not load.load_scene(boxes(tmp_path / "c.xml", METER.format(""), METER.format(move))).merged
 
 
+def test_emitters_keep_the_order_of_the_file_in_a_merged_scene():
+    """Mitsuba 3.9.1 puts what it joins in the order of addresses: 32 lamps, another order in each process."""
+    merged, apart = (load.load_scene("lamp_bays", merge=merge).scene for merge in (True, False))
+    assert len(merged.shapes()) < len(apart.shapes())
+    corners = [[np.array(e.get_shape().bbox().min).ravel() for e in scene.emitters()] for scene in (merged, apart)]
+    assert len(corners[0]) == 32 and np.array_equal(*corners)
+
+
 def test_what_is_wrong_is_said_where_merging_is_not_why(tmp_path):
     with pytest.raises(load.InputError, match=r"cannot load .*no\.ply"):
         mesh = '<shape type="ply"> <string name="filename" value="no.ply"/> </shape>'

@@ -138,8 +138,10 @@ def load_scene(
         return state, own
 
     def make(state):
-        config.merge_meshes = config.merge_equivalent = merge
+        config.merge_meshes, config.merge_equivalent = False, merge
         mi.parser.transform_all(config, state)
+        if merge:
+            _merge_meshes(state)
         made = mi.parser.instantiate(config, state)
         return made[0] if isinstance(made, (list, tuple)) else made
 
@@ -170,6 +172,33 @@ def load_scene(
         integrator=own.props.plugin_name() if own is not None else "path",
         merged=merge,
     )
+
+
+def _merge_meshes(state) -> None:
+    """Let Mitsuba join the meshes of a scene, those of emitters and sensors excepted.
+
+    `transform_merge_meshes` hands over everything, and what it made is in the order of addresses in memory, another in
+    each process. So the same seed gave another image wherever the order of emitters matters.
+    """
+    import mitsuba as mi
+
+    root, apart = state.root, (mi.ObjectType.Emitter, mi.ObjectType.Sensor)
+
+    def children(props) -> dict:
+        kind = mi.Properties.Type.ResolvedReference
+        return {name: state.nodes[props[name].index()] for name in props.keys() if props.type(name) == kind}
+
+    plain = [name for name, node in children(root.props).items() if node.type == mi.ObjectType.Shape
+             and not any(child.type in apart for child in children(node.props).values())]  # fmt: skip
+    if root.type != mi.ObjectType.Scene or not plain:
+        return
+    merged = mi.parser.SceneNode()
+    merged.type, merged.props = mi.ObjectType.Shape, mi.Properties("merge")
+    for name in plain:
+        merged.props[name] = root.props[name]
+        del root.props[name]
+    root.props["_arg_merged"] = mi.Properties.ResolvedReference(len(state.nodes))
+    state.nodes.append(merged)
 
 
 def scene_parameters(path: Path) -> list[str]:
