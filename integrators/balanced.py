@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.caches.blend import sigma_channels
+from mi_neural.caches.material import material_of, needs_material
 from mi_neural.estimators import spread
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
@@ -16,13 +17,14 @@ from mi_neural.render import vertex
 @dataclass
 class End:
     """Where a path has stopped: at `position`, where the cache is queried for the light from `direction` (both in world
-    space), times the throughput `β`. A PyTree."""
+    space), times the throughput `β`. `material`: what else the cache needs of the surface, by name. A PyTree."""
 
     position: mi.Point3f
     normal: mi.Vector3f
     direction: mi.Vector3f
     β: mi.Color3f
     queried: mi.Bool
+    material: dict
 
 
 class Thinned(paths.Surface):
@@ -71,19 +73,22 @@ def estimate(integrator, scene, lights, field, path, sampler):
             scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled,
             follow=lambda bs, delta: ~stops, direct=direct,
         )  # fmt: skip
-        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops)
+        material = material_of(field, path.si, bsdf, stops)
+        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops, material)
         end = dr.select(stops, here, end)
         direct_first = dr.select(is_first, path.β * found.direct, direct_first)
         path, sampler = paths.roulette(paths.advance(path, found, integrator.depth_limit), sampler, integrator.rr_depth)
         return path, end, direct_first, mi.Bool(False), sampler
 
     seen, n = path.L, dr.width(path.si.t)
-    none = dr.zeros(End, n)
+    material = {"material": (mi.Color3f(0), mi.Float(0))} if needs_material(field) else {}
+    zeros = (dr.zeros(kind, n) for kind in (mi.Point3f, mi.Vector3f, mi.Vector3f, mi.Color3f, mi.Bool))
+    none = End(*zeros, material)
     path, end, direct_first, _, sampler = dr.while_loop(
         (path, none, mi.Color3f(0), mi.Bool(True), sampler), lambda path, *_: path.active, step,
         label="balanced termination",
     )  # fmt: skip
-    features = field.encode(end.position, end.normal)
+    features = field.encode(end.position, end.normal, **end.material)
     cache = dr.select(end.queried, end.β * field.query(features, end.direction), 0)
     channels = {"direct": direct_first, "cache": cache, "residual": path.L - seen - direct_first}
     channels |= {"depth": path.depth - dr.select(end.queried, 1.0, 0.0)}  # no ray where it stopped

@@ -1,4 +1,6 @@
-"""`preset="paper"` of `nvc_lights`: constants as printed (Bokšanský and Meister 2025), keys before them, no bias."""
+"""`preset="paper"` of the plugins: constants as printed in their sources, keys before them, images with them."""
+
+import json
 
 import drjit as dr
 import mitsuba as mi
@@ -9,7 +11,11 @@ from test_vertex import lights
 from test_vertex import test_scene as lit
 
 from mi_neural import scenes
-from mi_neural.caches import visibility
+from mi_neural.caches import loss, visibility
+from mi_neural.caches.field import CacheFileError, Field, FieldShape
+from mi_neural.caches.incident import Training, trace_records
+from mi_neural.caches.material import material_of
+from mi_neural.caches.reliability import Reliability
 
 #: Smaller than printed, for time alone.
 QUICK = {"train_samples": 256, "train_steps": 1}
@@ -106,3 +112,223 @@ def test_points_lie_where_the_keys_say(world, vertices):
 def test_values_that_are_none_are_refused_by_name(key, value):
     with pytest.raises((ValueError, RuntimeError), match=f"nvc_lights: {key} is '?{value}'?; "):
         mi.load_dict({"type": "nvc_lights", key: value})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Caches of incident radiance (Dereviannykh et al. 2025, Klepikov et al.)
+
+#: Smaller than printed, for time alone.
+SMALL = {"levels": 2, "hashmap_size": 256, "width": 8, "hidden_layers": 1, "train_frames": 3, "train_samples": 32}
+
+
+def room(name: str = "cornell_box", size: int = 16):
+    return mi.load_file(str(scenes.path(name)), resx=size, resy=size)
+
+
+@pytest.mark.parametrize("kind", ["nirc", "nirc_two_level"])
+def test_constants_of_incident_radiance_are_those_printed(kind):
+    integrator = mi.load_dict({"type": kind, "preset": "paper", "train_frames": 1})
+    integrator.train(room(size=24), 1)
+    cache = integrator.cache
+    shape, training = cache.field.shape, cache.training
+    assert (shape.n_levels, shape.n_features, shape.width, shape.n_hidden, shape.leak) == (12, 2, 64, 4, 0)
+    assert shape.surface == ("normal", "albedo", "roughness") and shape.n_inputs == 64  # of these 25 of the direction
+    assert shape.n_first == 64 - 25
+    layers = [tuple(v.shape) for k, v in cache.field.current.mlp.items() if k.endswith("weights")]
+    assert layers == [(64, 64)] * 4 + [(3, 64)]
+    assert (training.learning_rate, training.last_rate, training.ema_decay) == (0.001, 1, 0.99)
+    assert training.ema_debiased and training.loss == "weighted" and training.epsilon == 0.001
+    assert training.n_paths == 9 and training.n_vertices - 1 == 3  # a path for each tile of 8x8; records
+    assert float(training.rate(0)) == float(training.rate(5000)) == 0.001
+    adam = cache.field.optimizer
+    assert (adam.beta_1, adam.beta_2, adam.epsilon) == (0.9, 0.99, 1e-15)
+    if kind == "nirc":
+        assert integrator.termination == "balanced"
+    else:
+        assert integrator.split.alpha == 1
+
+
+def test_constants_of_reliability_are_those_printed():
+    integrator = mi.load_dict({"type": "nirc", "preset": "paper", "blend": "reliability", **SMALL})
+    integrator.train(room(), 1)
+    c = integrator.cache.queried.grid.constants
+    assert (c.measure, c.decay, c.warm_up, c.kappa, c.per_record) == ("correlation", 0.9, 128, 4, False)
+
+
+def test_keys_of_reliability_reach_the_statistics():
+    keys = {"reliability_decay": 0.5, "reliability_warm_up": 7, "reliability_kappa": 2.0,
+            "reliability_epsilon": 0.25, "reliability_resolution": 5, "reliability": "concordance"}  # fmt: skip
+    for preset in ("measured", "paper"):
+        integrator = mi.load_dict({"type": "nrc" if preset == "measured" else "nirc", "blend": "switch", **SMALL,
+                                   **({"preset": preset} if preset == "paper" else {}), **keys})  # fmt: skip
+        integrator.train(room(), 1)
+        c = integrator.cache.queried.grid.constants
+        assert (c.decay, c.warm_up, c.kappa, c.epsilon, c.resolution) == (0.5, 7, 2, 0.25, 5)
+        assert c.measure == "concordance"
+
+
+@pytest.mark.parametrize("kind", ["nirc", "nirc_two_level"])
+def test_keys_go_before_the_preset_of_incident_radiance(kind):
+    keys = {**SMALL, "direction_degree": 1, "inputs": "roughness, normal", "loss": "local", "epsilon": 0.5,
+            "learning_rate": 0.02, "last_rate": 0.5, "ema_decay": 0.5, "ema_debiased": False, "train_vertices": 3,
+            "reliability": "regression"}  # fmt: skip
+    own = {"termination": "primary"} if kind == "nirc" else {"alpha": 0.5}
+    integrator = mi.load_dict({"type": kind, "preset": "paper", **keys, **own})
+    shape, t = integrator.cache.shape, integrator.cache.training
+    assert (shape.n_levels, shape.width, shape.n_hidden, shape.direction_degree) == (2, 8, 1, 1)
+    assert shape.surface == ("normal", "roughness")
+    assert (t.n_paths, t.n_vertices, t.loss, t.epsilon, t.learning_rate) == (32, 3, "local", 0.5, 0.02)
+    assert (t.last_rate, t.ema_decay, t.ema_debiased) == (0.5, 0.5, False)
+    if kind == "nirc":
+        assert integrator.termination == "primary" and integrator.cache.reliability.measure == "regression"
+    else:
+        assert integrator.split.alpha == 0.5
+
+
+@pytest.mark.parametrize("kind", ["nirc", "nirc_two_level"])
+def test_default_of_incident_radiance_is_as_measured(kind):
+    for keys in ({}, {"preset": "measured"}):
+        cache = mi.load_dict({"type": kind, **keys}).cache
+        assert cache.training == Training() and cache.shape == FieldShape()
+        if kind == "nirc":
+            assert cache.reliability == Reliability()
+
+
+@pytest.mark.parametrize("keys", [
+    {"type": "nirc"}, {"type": "nirc", "termination": "spread"}, {"type": "nirc", "termination": "primary"},
+    {"type": "nirc", "blend": "reliability", "reliability_warm_up": 0}, {"type": "nirc", "blend": "fast"},
+    {"type": "nirc", "inputs": "normal"}, {"type": "nirc_two_level", "cache_samples": 2, "every_vertex": True},
+    {"type": "nirc_two_level", "mode": "progressive"}, {"type": "nirc_two_level", "ris": True, "cache_samples": 2},
+], ids=lambda keys: "-".join(str(v) for v in keys.values()))  # fmt: skip
+def test_incident_radiance_renders_with_the_preset(keys):
+    """Materials of all kinds; the scene's mean has to be right to 20 % after so little training."""
+    scene = lit(lights("all"), 12)
+    integrator = mi.load_dict({"preset": "paper", **{**SMALL, "train_samples": 256, "train_frames": 24}, **keys})
+    image = np.array(mi.render(scene, integrator=integrator, spp=32))
+    known = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=128))
+    assert np.isfinite(image).all() and integrator.statistics()["nonfinite"] == 0
+    assert integrator.statistics()["recoveries"] == 0
+    print(f"mean {image.mean() / known.mean():.3f} of that of path")
+    assert image.mean() == pytest.approx(known.mean(), rel=0.2)
+
+
+def test_two_level_estimator_has_the_mean_of_path_with_the_preset():
+    scene = lit(lights("area"), 8)
+    keys = {"preset": "paper", **SMALL, "cache_samples": 2, "residual_samples": 1, "residual_probability": 0.5}
+    known = renders(scene, {"type": "path"}, 16, 256, first_seed=1000)
+    ours = renders(scene, {"type": "nirc_two_level", **keys}, 16, 128)
+    assert_same_mean(ours, known, "nirc_two_level", relative=1e-5)
+
+
+def test_weighted_loss_is_that_of_the_source(rng):
+    p, y, t = (rng.uniform(0, 3, (3, 16)).astype("f4") for _ in range(3))
+    pdf = rng.uniform(0.1, 9, 16).astype("f4")
+    found = loss.weighted_relative_l2(mi.Color3f(p), mi.Color3f(y), mi.Color3f(t), mi.Float(pdf), 1e-3)
+    wanted = pdf * ((t * p - t * y) ** 2).sum(0) / ((t * p).mean(0) ** 2 + 1e-3)
+    np.testing.assert_allclose(np.array(found), wanted, rtol=1e-4)
+
+
+def test_weighted_loss_gets_throughput_and_density_of_each_record():
+    """In a room of Lambertians the throughput of a BSDF sample is its albedo, and its density cos/π."""
+    scene = room("lit_cube", 8)
+    training = Training(n_paths=64, n_vertices=3, loss="weighted")
+    records, _ = trace_records(scene, scene.sensors()[0], None, training, mi.UInt32(1))
+    valid = np.array(records.valid)
+    cosine = np.array(dr.abs(dr.dot(records.normal, records.direction)))[valid]
+    assert valid.sum() > 32
+    np.testing.assert_allclose(np.array(records.pdf)[valid], cosine / np.pi, rtol=1e-3)
+    np.testing.assert_allclose(np.array(records.weight).T[valid], 0.5, rtol=1e-3)
+
+
+def test_records_have_the_material_that_queries_see():
+    scene = room("lit_cube", 8)
+    field = Field([-2] * 3, [2] * 3, FieldShape(n_levels=2, hashmap_size=256, surface=("albedo", "roughness")))
+    records, _ = trace_records(scene, scene.sensors()[0], field, Training(n_paths=64, n_vertices=3), mi.UInt32(1))
+    valid = np.array(records.valid)
+    np.testing.assert_allclose(np.array(records.albedo).T[valid], 0.5, rtol=1e-3)
+    ray, _ = scene.sensors()[0].sample_ray(0, 0.5, [0.4, 0.6], [0.5, 0.5])
+    si = scene.ray_intersect(ray)
+    albedo, roughness = material_of(field, si, si.bsdf(), mi.Bool(True))["material"]
+    np.testing.assert_allclose(np.array(albedo).ravel(), 0.5, rtol=1e-3)
+    np.testing.assert_allclose(np.array(records.roughness)[valid], float(roughness[0]), rtol=1e-3)
+    assert material_of(Field([-2] * 3, [2] * 3), si, si.bsdf(), mi.Bool(True)) == {}
+
+
+@pytest.mark.parametrize("name", ["normal", "albedo", "roughness"])
+def test_prediction_and_query_agree_on_each_input(name):
+    """What is trained is what is queried, and each input makes a difference."""
+    field = Field([-1] * 3, [1] * 3, FieldShape(n_levels=2, hashmap_size=256, width=16, surface=(name,)))
+    n = mi.Vector3f([0, 0.6, 0], [0, 0, -1], [1, 0.8, 0])
+    material = mi.Color3f([0.1, 0.5, 0.9]), mi.Float([0.05, 0.3, 1])
+    x, w = dr.zeros(mi.Point3f, 3), mi.Vector3f(0.6, 0, 0.8)
+    known = np.array(field.raw(field.encode(x, n, False, material), w, averaged=False)).T
+    found = np.array(field.predict(x, w, n, material)).T
+    np.testing.assert_allclose(found, known, rtol=1e-4, atol=1e-6)
+    assert len({round(float(v[0]), 6) for v in known}) == 3
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.5, 0.99, 1.0])
+def test_debiased_average_is_that_of_all_steps(decay):
+    training, rng = Training(ema_decay=decay, ema_debiased=True), np.random.default_rng(3)
+    values, average = rng.normal(size=20), 0.0
+    for k, value in enumerate(values):
+        d = float(mi.Float(training.decay(mi.Float(k)))[0])
+        average = d * average + (1 - d) * value
+        weights = decay ** np.arange(k, -1, -1.0)
+        assert average == pytest.approx((weights * values[: k + 1]).sum() / weights.sum(), abs=1e-4)
+
+
+def test_cache_files_of_before_the_keys_are_read(tmp_path):
+    """Their header knows nothing of inputs of the surface."""
+    scene = room()
+    nirc = mi.load_dict({"type": "nirc", **SMALL})
+    nirc.train(scene, 2)
+    nirc.save_cache(tmp_path / "new.npz")
+    with np.load(tmp_path / "new.npz") as entries:
+        arrays = dict(entries)
+    header = json.loads(bytes(arrays.pop("header")).decode())
+    del header["shape"]["surface"]
+    with open(tmp_path / "old.npz", "wb") as f:
+        np.savez(f, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+    new = mi.load_dict({"type": "nirc", **SMALL})
+    new.load_cache(tmp_path / "old.npz", scene)
+    for name, value in nirc.cache.field.arrays().items():
+        np.testing.assert_array_equal(new.cache.field.arrays()[name], value)
+
+
+def test_cache_files_of_the_preset_are_read_by_it_alone(tmp_path):
+    scene, keys = room(), {"type": "nirc", "preset": "paper", **SMALL}
+    nirc = mi.load_dict(keys)
+    nirc.train(scene, 2)
+    nirc.save_cache(tmp_path / "a.npz")
+    again = mi.load_dict(keys)
+    again.load_cache(tmp_path / "a.npz", scene)
+    assert again.cache.field.shape == nirc.cache.field.shape and again.cache.steps == nirc.cache.steps
+    with pytest.raises(CacheFileError, match="give it the same sizes"):
+        mi.load_dict({"type": "nirc", **SMALL}).load_cache(tmp_path / "a.npz")
+
+
+def test_paths_by_tiles_follow_the_film():
+    integrator = mi.load_dict({"type": "nirc", **SMALL, "train_samples": -1})
+    for size, tiles in ((16, 4), (20, 9)):
+        integrator.train(room(size=size), 1)
+        assert integrator.cache.training.n_paths == tiles
+
+
+@pytest.mark.parametrize("keys, message", [
+    ({"preset": "papers"}, "preset is 'papers'; give one of: measured, paper"),
+    ({"inputs": "view"}, "inputs is 'view'; give none, or a list of: normal, albedo, roughness"),
+    ({"loss": "squared"}, "loss is 'squared'; give one of: local, weighted"),
+    ({"epsilon": 0.0}, "epsilon is 0.0; "), ({"direction_degree": 8}, "direction_degree is 8; "),
+    ({"direction_degree": -1}, "direction_degree is -1; "), ({"train_samples": -2}, "train_samples is -2; "),
+    ({"reliability_decay": 1.0}, "reliability_decay is 1.0; "),
+    ({"reliability_warm_up": -1}, "reliability_warm_up is -1; "),
+    ({"reliability_kappa": 0.0}, "reliability_kappa is 0.0; "),
+    ({"reliability_epsilon": 0.0}, "reliability_epsilon is 0.0; "),
+    ({"reliability_resolution": 0}, "reliability_resolution is 0; "),
+    ({"preset": "paper", "cache": "spatial_hash"}, "cache is 'spatial_hash', but the preset 'paper' is of the network"),
+    ({"preset": "paper", "termination": "auto"}, "termination 'auto' is neural_path, which has no preset"),
+])  # fmt: skip
+def test_values_that_incident_radiance_cannot_have_are_refused_by_name(keys, message):
+    with pytest.raises((ValueError, RuntimeError), match=f"nirc: {message}"):
+        mi.load_dict({"type": "nirc", **keys})

@@ -1,0 +1,49 @@
+"""Constants as their sources print them: what ``preset="paper"`` sets.
+
+One data class for each source; its fields are keys of plugins. A key that the user gives goes before its field, and a
+plugin takes nothing of the fields whose keys it does not have. What a source does not print has no field and keeps our
+default. The page of each plugin lists both values, with the measurement that led from one to the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+#: Values of the key ``preset``: our defaults, and the constants as printed.
+PRESETS = ("measured", "paper")
+
+
+@dataclass(frozen=True)
+class TwoLevel:
+    """Dereviannykh et al. 2025, "Neural Two-Level Monte Carlo Real-Time Rendering", and the authors' published
+    configuration (METHODS 1).
+
+    `direction_degree`: spherical harmonics of 25 values, which the authors count as 5 bands, of degree 0 to 4.
+    `train_vertices`: records at up to 3 vertices. `train_samples`: -1, one path for each tile of 8x8 pixels.
+    """
+
+    inputs: str = "normal, albedo, roughness"
+    levels: int = 12
+    direction_degree: int = 4
+    width: int = 64
+    hidden_layers: int = 4
+    loss: str = "weighted"
+    epsilon: float = 1e-3
+    learning_rate: float = 1e-3
+    last_rate: float = 1.0
+    ema_decay: float = 0.99
+    ema_debiased: bool = True
+    train_samples: int = -1
+    train_vertices: int = 4
+    termination: str = "balanced"
+    alpha: float = 1.0
+
+
+@dataclass(frozen=True)
+class ReliabilityWeighted:
+    """Klepikov et al., "Reliability-Weighted Averaging for Real-Time Neural Incident Radiance Caching", section 3."""
+
+    reliability: str = "correlation"
+    reliability_decay: float = 0.9
+    reliability_warm_up: int = 128
+    reliability_kappa: float = 4.0
