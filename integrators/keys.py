@@ -15,7 +15,7 @@ LIGHT_SAMPLER_KEY = """
 
 
 #: Keys of whole numbers that have no default of their own.
-WHOLE = ("levels", "hashmap_size", "width", "hidden_layers", "cache_samples", "residual_samples")
+WHOLE = ("levels", "hashmap_size", "width", "hidden_layers", "cache_samples", "residual_samples", "train_records")
 
 
 class Keys:

@@ -1,6 +1,7 @@
 """`preset="paper"` of the plugins: constants as printed in their sources, keys before them, images with them."""
 
 import json
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,10 +12,12 @@ from test_vertex import lights
 from test_vertex import test_scene as lit
 
 from mi_neural import scenes
-from mi_neural.caches import loss, visibility
+from mi_neural.caches import loss, radiance_cache, visibility
 from mi_neural.caches.field import CacheFileError, Field, FieldShape
 from mi_neural.caches.incident import Training, trace_records
 from mi_neural.caches.material import material_of
+from mi_neural.caches.outgoing import OutgoingShape, OutgoingTraining
+from mi_neural.caches.radiance_cache import DispatchFlags, RadianceCache
 from mi_neural.caches.reliability import Reliability
 
 #: Smaller than printed, for time alone.
@@ -278,18 +281,23 @@ def test_debiased_average_is_that_of_all_steps(decay):
         assert average == pytest.approx((weights * values[: k + 1]).sum() / weights.sum(), abs=1e-4)
 
 
+def without_surface(new, old) -> None:
+    """Write a cache file as it was before networks could get inputs of the surface."""
+    with np.load(new) as entries:
+        arrays = dict(entries)
+    header = json.loads(bytes(arrays.pop("header")).decode())
+    del header["shape"]["surface"]
+    with open(old, "wb") as f:
+        np.savez(f, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+
+
 def test_cache_files_of_before_the_keys_are_read(tmp_path):
     """Their header knows nothing of inputs of the surface."""
     scene = room()
     nirc = mi.load_dict({"type": "nirc", **SMALL})
     nirc.train(scene, 2)
     nirc.save_cache(tmp_path / "new.npz")
-    with np.load(tmp_path / "new.npz") as entries:
-        arrays = dict(entries)
-    header = json.loads(bytes(arrays.pop("header")).decode())
-    del header["shape"]["surface"]
-    with open(tmp_path / "old.npz", "wb") as f:
-        np.savez(f, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+    without_surface(tmp_path / "new.npz", tmp_path / "old.npz")
     new = mi.load_dict({"type": "nirc", **SMALL})
     new.load_cache(tmp_path / "old.npz", scene)
     for name, value in nirc.cache.field.arrays().items():
@@ -332,3 +340,112 @@ def test_paths_by_tiles_follow_the_film():
 def test_values_that_incident_radiance_cannot_have_are_refused_by_name(keys, message):
     with pytest.raises((ValueError, RuntimeError), match=f"nirc: {message}"):
         mi.load_dict({"type": "nirc", **keys})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Caches of outgoing radiance (Müller et al. 2021, AMD's guide)
+
+
+def test_constants_of_outgoing_radiance_are_those_printed():
+    integrator = mi.load_dict({"type": "nrc", "preset": "paper", "train_frames": 1})
+    cache, training = integrator.cache, integrator.cache.training
+    integrator.train(room(), 1)
+    shape = cache.field.shape
+    assert (shape.width, shape.n_hidden) == (64, 2) and shape.inputs == ("normal", "view", "albedo", "roughness")
+    layers = [tuple(v.shape) for k, v in cache.field.current.mlp.items() if k.endswith("weights")]
+    assert layers == [(64, shape.n_inputs), (64, 64), (3, 64)]
+    assert (training.learning_rate, training.last_rate, training.ema_decay) == (0.002, 1, 0.99)
+    assert training.ema_debiased and training.epsilon == 0.01
+    assert float(training.rate(0)) == float(training.rate(5000)) == 0.002
+    assert training.capacity == 16384 and integrator.train_steps == 4
+    assert (training.unbounded_share, training.world_share, training.threshold) == (1 / 16, 0, 0.01)
+    assert (integrator.spread_threshold, training.roughening) == (0.01, 0)
+    assert cache.reliability.measure == "correlation"
+
+
+def test_averaged_weights_of_the_preset_are_those_of_the_source():
+    """``w̄_t = (1 - a)/η_t w_t + a η_{t-1}/η_t w̄_{t-1}`` of all steps, with a = 0.99, whatever their age."""
+    integrator = mi.load_dict({"type": "nrc", "preset": "paper", **SMALL, "train_records": 64})
+    scene, weights, average = room(), [], 0
+    name = None
+    for _ in range(4):
+        integrator.train(scene, 1)
+        arrays = integrator.cache.field.snapshot()
+        name = name or next(k for k in arrays if k.endswith("weights") and k.startswith("current"))
+        weights.append(arrays[name])
+    share = 0.99 ** np.arange(3, -1, -1.0)
+    average = sum(s * w for s, w in zip(share, weights, strict=True)) / share.sum()
+    np.testing.assert_allclose(arrays[name.replace("current", "averaged")], average, rtol=1e-3, atol=1e-6)
+
+
+def test_keys_go_before_the_preset_of_outgoing_radiance():
+    keys = {**SMALL, "train_records": 40, "learning_rate": 0.05, "last_rate": 0.5, "ema_decay": 0.9, "epsilon": 2.0,
+            "ema_debiased": False, "unbounded_share": 0.5, "world_share": 0.1, "inputs": "normal", "train_steps": 2,
+            "spread_threshold": 0.5}  # fmt: skip
+    integrator = mi.load_dict({"type": "nrc", "preset": "paper", **keys})
+    integrator.train(room(), 1)
+    shape, t = integrator.cache.field.shape, integrator.cache.training
+    assert (shape.n_levels, shape.width, shape.n_hidden, shape.inputs) == (2, 8, 1, ("normal",))
+    assert (t.n_paths, t.capacity, t.learning_rate, t.last_rate, t.ema_decay) == (32, 40, 0.05, 0.5, 0.9)
+    assert (t.ema_debiased, t.epsilon, t.unbounded_share, t.world_share) == (False, 2, 0.5, 0.1)
+    assert t.threshold == integrator.spread_threshold == 0.5 and integrator.train_steps == 2
+
+
+def test_default_of_outgoing_radiance_is_as_measured():
+    for keys in ({}, {"preset": "measured"}):
+        integrator = mi.load_dict({"type": "nrc", **keys})
+        t = replace(integrator.cache.training, n_paths=OutgoingTraining.n_paths)  # more on a GPU
+        assert t == OutgoingTraining() and integrator.cache.shape == OutgoingShape() and integrator.train_steps == 1
+
+
+@pytest.mark.parametrize("keys", [{}, {"blend": "reliability", "reliability_warm_up": 0}], ids=["ema", "reliability"])
+def test_outgoing_radiance_renders_with_the_preset(keys):
+    """The scene's mean has to be right to 20 % after so little training, at a rate of 0.02 instead of 0.002."""
+    scene = lit(lights("all"), 12)
+    quick = {**SMALL, "train_samples": 256, "train_frames": 24, "learning_rate": 0.02}
+    integrator = mi.load_dict({"type": "nrc", "preset": "paper", **quick, **keys})
+    image = np.array(mi.render(scene, integrator=integrator, spp=32))
+    known = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=128))
+    facts = integrator.statistics()
+    assert np.isfinite(image).all() and facts["nonfinite"] == facts["recoveries"] == 0
+    print(f"mean {image.mean() / known.mean():.3f} of that of path")
+    assert image.mean() == pytest.approx(known.mean(), rel=0.2)
+
+
+def test_cache_files_of_outgoing_radiance_of_before_the_keys_are_read(tmp_path):
+    scene = room()
+    nrc = mi.load_dict({"type": "nrc", **SMALL})
+    nrc.train(scene, 2)
+    nrc.save_cache(tmp_path / "new.npz")
+    without_surface(tmp_path / "new.npz", tmp_path / "old.npz")
+    new = mi.load_dict({"type": "nrc", **SMALL})
+    new.load_cache(tmp_path / "old.npz", scene)
+    for name, value in nrc.cache.field.arrays().items():
+        np.testing.assert_array_equal(new.cache.field.arrays()[name], value)
+
+
+@pytest.mark.parametrize("keys, message", [
+    ({"preset": "published"}, "preset is 'published'; give one of: measured, paper"),
+    ({"train_records": 0}, "train_records is 0; "), ({"train_records": 1.5}, "train_records is 1.5; "),
+    ({"epsilon": -1.0}, "epsilon is -1.0; "),
+])  # fmt: skip
+def test_values_that_outgoing_radiance_cannot_have_are_refused_by_name(keys, message):
+    with pytest.raises((ValueError, RuntimeError), match=f"nrc: {message}"):
+        mi.load_dict({"type": "nrc", **keys})
+
+
+def test_radiance_cache_takes_the_preset(rng):
+    cache = RadianceCache(64, 64, preset="paper")
+    assert (cache.field.shape.width, cache.field.shape.n_hidden) == (64, 2)
+    assert (radiance_cache.LEARNING_RATE, radiance_cache.WEIGHT_SMOOTHING) == (0.002, 0.99)
+    points, targets = (rng.uniform(0.1, 0.9, (64, n)).astype("f4") for n in (11, 3))
+    flags = DispatchFlags.TRAINING | DispatchFlags.INFERENCE
+    cache.dispatch(flags, train_inputs=points, train_targets=targets, prediction_inputs=points)
+    found = cache.dispatch(DispatchFlags.INFERENCE, prediction_inputs=points)
+    assert np.isfinite(found).all() and cache.statistics["steps"] == 1
+
+    shape = OutgoingShape(width=16)
+    assert RadianceCache(64, 64, preset="paper", shape=shape).field.shape == shape
+    assert RadianceCache(64, 64).field.shape == OutgoingShape()
+    with pytest.raises(ValueError, match="preset is 'papers'; give one of: measured, paper"):
+        RadianceCache(64, 64, preset="papers")

@@ -352,6 +352,8 @@ class OutgoingTraining(Training):
         for name in ("unbounded_share", "world_share", "roughening"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in [0, 1]")
+        if self.n_records is not None and self.n_records < 1:
+            raise ValueError(f"n_records is {self.n_records}; it must be at least 1")
         if not self.threshold >= 0:
             raise ValueError(f"threshold is {self.threshold}; it must be 0 or more")
 

@@ -47,3 +47,35 @@ class ReliabilityWeighted:
     reliability_decay: float = 0.9
     reliability_warm_up: int = 128
     reliability_kappa: float = 4.0
+
+
+@dataclass(frozen=True)
+class RadianceCacheGuide:
+    """Advanced Micro Devices, "AMD FSR Radiance Caching (Preview)", version 0.9.0, 2025: its inputs, its sample code,
+    and the defaults of its two overrides."""
+
+    inputs: str = "normal, view, albedo, roughness"
+    spread_threshold: float = 0.01
+    learning_rate: float = 0.002
+    ema_decay: float = 0.99
+
+
+@dataclass(frozen=True)
+class RadianceCaching:
+    """Müller et al. 2021, "Real-time Neural Radiance Caching for Path Tracing", with a hash grid for the position
+    (METHODS 2).
+
+    `train_steps`, `train_records`: 4 steps of 16,384 records a frame. `train_samples`: there so many paths as give that
+    number in each scene; here half as many paths as records, which suffices where paths have two or more.
+    """
+
+    width: int = 64
+    hidden_layers: int = 2
+    epsilon: float = 0.01
+    last_rate: float = 1.0
+    ema_debiased: bool = True
+    train_steps: int = 4
+    train_records: int = 16384
+    train_samples: int = 8192
+    unbounded_share: float = 1 / 16
+    world_share: float = 0.0
