@@ -79,3 +79,38 @@ class RadianceCaching:
     train_samples: int = 8192
     unbounded_share: float = 1 / 16
     world_share: float = 0.0
+
+
+@dataclass(frozen=True)
+class NeuralVisibility:
+    """Bokšanský and Meister 2025, "Neural Visibility Cache for Real-Time Light Sampling", sections 3.2 and 3.3, figure
+    5: single lights, and NRC-DI (section 4.2), which has the same network, data and rates.
+
+    `train_samples`: 4096 points in the scene and as many on surfaces that the camera sees.
+    """
+
+    train_frames: int = 1
+    train_samples: int = 8192
+    world_points: float = 0.5
+    vertices: int = 1
+    loss: str = "squared"
+    first_rate: float = 0.05
+    last_rate: float = 0.001
+    rate_steps: int = 200
+    averaging: float = 0.0
+    levels: int = 10
+    base_resolution: int = 16
+    level_scale: float = 2.0
+    init: str = "he"
+    floor: float = 0.001
+    cluster_choice: str = "visibility"
+    within: str = "uniform"
+
+
+@dataclass(frozen=True)
+class ClusteredVisibility:
+    """What differs there for clusters of lights (section 3.4)."""
+
+    train_samples: int = 49152
+    levels: int = 8
+    base_resolution: int = 2
