@@ -554,3 +554,46 @@ def test_direct_light_by_visibility_renders_with_the_preset(mode, which):
 def test_values_that_direct_light_cannot_have_are_refused_by_name(key, value):
     with pytest.raises((ValueError, RuntimeError), match=f"nvc_direct: .*{key}(=| is )'?{value}"):
         mi.load_dict({"type": "nvc_direct", key: value})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# ReSTIR (Bokšanský and Meister 2025, section 4.1)
+
+
+def test_constants_of_restir_are_those_printed():
+    integrator = mi.load_dict({"type": "restir_di", "preset": "paper"})
+    assert (integrator.initial_candidates, integrator.history, integrator.spatial_radius) == (8, 20, 32)
+    assert integrator.candidate_shadow_ray and integrator.visible_target
+    for keys in ({"candidates": "nvc"}, {"light_sampler": {"type": "nvc_lights"}}):
+        integrator = mi.load_dict({"type": "restir_di", "preset": "paper", **keys})
+        assert not integrator.candidate_shadow_ray and not integrator.visible_target
+    for keys in ({}, {"candidates": "nvc"}, {"preset": "measured", "candidates": "nvc"}):
+        integrator = mi.load_dict({"type": "restir_di", **keys})
+        assert (integrator.initial_candidates, integrator.history, integrator.spatial_radius) == (8, 20, -1)
+        assert integrator.candidate_shadow_ray and integrator.visible_target
+
+
+def test_keys_go_before_the_preset_of_restir():
+    keys = {"candidates": "nvc", "initial_candidates": 3, "history": 2.0, "spatial_radius": 5.0,
+            "candidate_shadow_ray": True}  # fmt: skip
+    integrator = mi.load_dict({"type": "restir_di", "preset": "paper", **keys})
+    assert (integrator.initial_candidates, integrator.history, integrator.spatial_radius) == (3, 2, 5)
+    assert integrator.candidate_shadow_ray
+
+
+def test_restir_renders_with_the_preset():
+    """Its candidates are those of the visibility cache as printed."""
+    integrator = mi.load_dict({"type": "restir_di", "preset": "paper", "candidates": "nvc"})
+    image = np.array(mi.render(lit(lights("all"), 8), integrator=integrator, spp=2))
+    assert np.isfinite(image).all() and image.mean() > 0
+    cache = integrator.state.chooser.cache
+    assert cache.field.shape.n_levels == 10 and cache.training.n_points == 8192 and cache.steps == 2
+
+
+@pytest.mark.parametrize("key, value, message", [
+    ("preset", "papers", "preset is 'papers'; give one of: measured, paper"),
+    ("candidate_shadow_ray", 1.5, "candidate_shadow_ray is 1.5; give true or false"),
+])  # fmt: skip
+def test_values_that_restir_cannot_have_are_refused_by_name(key, value, message):
+    with pytest.raises((ValueError, RuntimeError), match=f"restir_di: {message}"):
+        mi.load_dict({"type": "restir_di", key: value})

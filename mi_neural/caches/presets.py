@@ -114,3 +114,19 @@ class ClusteredVisibility:
     train_samples: int = 49152
     levels: int = 8
     base_resolution: int = 2
+
+
+@dataclass(frozen=True)
+class ReSTIR:
+    """The screen-space ReSTIR of Bokšanský and Meister 2025 (section 4.1), the baseline there."""
+
+    initial_candidates: int = 8
+    history: float = 20.0
+    spatial_radius: float = 32.0
+
+
+@dataclass(frozen=True)
+class ReSTIRWithVisibility:
+    """What differs there where candidates come from the visibility cache (sections 3.1 and 4.1.1)."""
+
+    candidate_shadow_ray: bool = False
