@@ -184,8 +184,8 @@ class CacheIntegrator(LearningIntegrator):
                 self.measure_scene(scene, view)
             return
         with dr.resume_grad():
+            self.fit_paths(sensor)
             if self.cache.field is None:
-                self.fit_paths(sensor)
                 self.cache.start(scene, view, self.state.lights)
             if not self.state.measured:
                 with dr.suspend_grad():
