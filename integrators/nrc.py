@@ -134,12 +134,14 @@ NRCIntegrator.__doc__ = (
     - ``train_steps``, ``train_samples``, ``train_records``: 4, 8192, 16384 / 1, 2048 (on a GPU 8192), three times as
       many / half the paths and twice the rate learn as well or better in equal time. The paper has as many paths as
       give 65,536 records a frame, the guide 1 to 5 % of the pixels as records; this number of paths is not printed.
-    - ``width``, ``hidden_layers``: 64, 2 / 32, 2 / not measured.
-    - ``epsilon``: 0.01 / 1 / stairwell, 300 steps: relative squared error 0.070 / 0.066.
+    - ``width``, ``hidden_layers``: 64, 2 / 32, 2 / Cornell box: relMSE 0.0041 / 0.0038.
+    - ``epsilon``: 0.01 / 1 / stairwell, 300 steps: relative squared error 0.070 / 0.066. Cornell box: relMSE 0.0045 /
+      0.0038.
     - ``unbounded_share``: 1/16 / 1/4 / ajar door, 300 steps: 0.97 / 1.00 of its light.
-    - ``world_share``: 0 (all paths start at the camera) / 0.25 / not measured alone.
-    - ``inputs``: all four / those that the scene needs, the others being the same everywhere.
-    - ``ema_decay``, ``ema_debiased``: 0.99, true / 0.99, false / not measured.
+    - ``world_share``: 0 (all paths start at the camera) / 0.25 / Cornell box, one view: relMSE 0.0033 / 0.0038; the
+      quarter is there for what leaves the view.
+    - ``inputs``: all four / those that the scene needs / Cornell box: relMSE 0.0048 / 0.0038.
+    - ``ema_decay``, ``ema_debiased``: 0.99, true / 0.99, false / Cornell box: relMSE 0.0034 / 0.0038.
     - ``spread_threshold``: 0.01 in both presets.
     - ``reliability``: correlation / evidence / steady flicker of the blend, over that of the average, 50 / 1.00.
     - ``reliability_decay``, ``reliability_warm_up``, ``reliability_kappa``: 0.9, 128, 4 in both presets; λ counts
@@ -150,7 +152,8 @@ NRCIntegrator.__doc__ = (
       bins each; squared error after 300 steps 0.180 / 0.139), biases in the network (the paper: none), the shortcut
       past it, points looked up above their surface.
 
-    The measurements are those of ``mi-neural doc measured`` and of the docstrings in ``mi_neural.caches``.
+    The measurements are those of ``mi-neural doc measured`` and of the docstrings in ``mi_neural.caches``. All of the
+    preset, after 200 steps of 2048 paths, has a relMSE of 0.011 in the Cornell box.
 
     Channels: ``traced``, ``cached`` (RGB each; with visible emission in ``traced`` they sum to the image), ``cache``
     (RGB: the cache seen directly at the first vertex), ``depth`` (segments up to the end of the path: a heat map of
