@@ -1,9 +1,10 @@
 """``nvc_lights``: lights by what they give, times their learned visibility."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import mitsuba as mi
 
+from mi_neural.caches import presets
 from mi_neural.caches.visibility import GRID, LOSSES, VisibilityCache, VisibilityTraining
 from mi_neural.emitters.common import LightSampler
 from mi_neural.lights import clusters
@@ -37,27 +38,13 @@ class Constants:
 
 @dataclass(frozen=True)
 class Paper(Constants):
-    """As printed (Bokšanský and Meister 2025, sections 3.2 to 3.4, figure 5)."""
-
-    train_frames: int = 1
-    train_samples: int = 8192
-    world_points: float = 0.5
-    vertices: int = 1
-    loss: str = "squared"
-    averaging: float = 0.0
-    levels: int = 10
-    base_resolution: int = 16
-    level_scale: float = 2.0
-    init: str = "he"
-    floor: float = 0.001
-    cluster_choice: str = "visibility"
-    within: str = "uniform"
+    """As printed; see :class:`~mi_neural.caches.presets.NeuralVisibility`."""
 
     def clustered(self) -> Constants:
-        return replace(self, train_samples=49152, levels=8, base_resolution=2)
+        return replace(self, **asdict(presets.ClusteredVisibility()))
 
 
-PRESETS = {"measured": Constants(), "paper": Paper()}
+PRESETS = {"measured": Constants(), "paper": Paper(**asdict(presets.NeuralVisibility()))}
 
 
 class NVCLightSampler(LightSampler):

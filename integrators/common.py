@@ -12,14 +12,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural import plan
-from mi_neural.caches.blend import BLENDS
-from mi_neural.caches.field import CacheFileError, FieldShape
+from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.files import damaged
-from mi_neural.caches.incident import IncidentCache, Training
-from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.integrators import gradients, planning
-from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
+from mi_neural.integrators.learning import LearningIntegrator
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
@@ -46,14 +43,6 @@ def _other_scene(path) -> str:
         f"the cache in '{path}' was trained in another scene, or the geometry has changed since; "
         "train one for this scene, or type reset()"
     )
-
-
-def _in_keys(message: str) -> str:
-    """A message of the library in the words of the plugin's keys."""
-    names = {"n_paths": "train_samples", "n_vertices": "train_vertices", **{v: k for k, v in planning.SIZES.items()}}
-    for name, key in names.items():
-        message = message.replace(name, key)
-    return message
 
 
 class _State:
@@ -83,7 +72,7 @@ class _State:
         self.image_open = False
 
 
-class CacheIntegrator(FilmIntegrator):
+class CacheIntegrator(LearningIntegrator):
     """Base of the integrators that train a cache of incident radiance. Subclasses give `estimate`.
 
     The state lives from one ``render`` call to the next; another scene starts it anew.
@@ -91,7 +80,6 @@ class CacheIntegrator(FilmIntegrator):
 
     #: Numbers of a pixel while an image is made: colour, alpha, weight, and copies of them.
     PIXEL_BYTES = 4 * FILM_VALUES
-    #: Training paths of a step where no key says it.
     #: Where gradients come from if no key says it.
     GRADIENT = "cache"
     #: Whether the plan may choose a light sampler where none is nested.
@@ -99,64 +87,24 @@ class CacheIntegrator(FilmIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.train_frames = props.get("train_frames", -1)
         self.train_steps = props.get("train_steps", 1)
         self.freeze_cache = props.get("freeze_cache", False)
-        self.seed = props.get("seed", 0)
         self.gradient = props.get("gradient", self.GRADIENT)
         self._check(self.gradient in gradients.GRADIENTS,
                     f"gradient is '{self.gradient}'; give one of: {', '.join(gradients.GRADIENTS)}")  # fmt: skip
-        self._check(self.train_frames >= -1, f"train_frames is {self.train_frames}; give -1 (until settled), 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
-        self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
-        self.plan_mode = props.get("plan", "scene")
-        self._check(self.plan_mode in plan.MODES, f"plan is '{self.plan_mode}'; give one of: {', '.join(plan.MODES)}")
-        try:
-            blend = props.get("blend", self.default_blend(props))
-            training = Training(
-                n_paths=props.get("train_samples", self.default_paths()),
-                n_vertices=props.get("train_vertices", 8),
-                learning_rate=props.get("learning_rate", self.default_rate(blend)),
-                ema_decay=props.get("ema_decay", 0.99),
-                last_rate=props.get("last_rate", 0.1 if blend == "ema" or "blend" not in props else 1.0),
-            )
-            sizes = {"levels": props.get("levels", None), "hashmap_size": props.get("hashmap_size", None),
-                     "width": props.get("width", None), "hidden_layers": props.get("hidden_layers", None)}  # fmt: skip
-            given = {k: v for k, v in sizes.items() if v is not None}
-            shape = FieldShape(**{planning.SIZES[k]: v for k, v in given.items()})
-        except ValueError as e:
-            raise ValueError(f"{self.plugin}: {_in_keys(str(e))}") from None
         self._set_channels(props.get("channels", ""))
         self.light_sampler = self.nested_sampler = light_sampler_of(props)
-        self.given = given
         if self.nested_sampler is not None:
             self.given["light_sampler"] = self.nested_sampler.plugin
             if self.plan_mode == "everything":
                 self.nested_sampler.plan_mode = self.plan_mode
-
-        measure, by_normal = props.get("reliability", "evidence"), props.get("reliability_normals", False)
-        self._check(blend in BLENDS, f"blend is '{blend}'; give one of: {', '.join(BLENDS)}")
-        self._check(measure in MEASURES, f"reliability is '{measure}'; give one of: {', '.join(MEASURES)}")
-        reliability = Reliability(measure=measure, split_normals=by_normal)
-        self.cache = IncidentCache(training, shape, seed=self.seed, blend=blend, reliability=reliability)
         self.state = _State()
         self.published = None  # see _publish()
         self.reset()
 
     # -------------------------------------------------------------------------------------------------------------
     # To be given by the plugin
-
-    def default_blend(self, props) -> str:
-        """Which weights answer where no key says it."""
-        return "ema"
-
-    def default_paths(self) -> int:
-        """Training paths a step where no key says it."""
-        return Training.n_paths
-
-    def default_rate(self, blend: str) -> float:
-        """The learning rate where no key says it."""
-        return Training.learning_rate
 
     def measure_scene(self, scene, sensor) -> None:
         """Measure, once per scene, what settings depend on; results go to ``state.measured``."""
@@ -236,6 +184,7 @@ class CacheIntegrator(FilmIntegrator):
                 self.measure_scene(scene, view)
             return
         with dr.resume_grad():
+            self.fit_paths(sensor)
             if self.cache.field is None:
                 self.cache.start(scene, view, self.state.lights)
             if not self.state.measured:

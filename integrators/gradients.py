@@ -21,6 +21,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural.caches.material import material_of
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators.base import as_seed
 from mi_neural.render import path as paths
@@ -277,7 +278,12 @@ def by_incident_cache(integrator, scene, field, path, found, after, sampler):
     """
     smooth = after.active & ~found.delta
     near = smooth & (found.bs.pdf <= SHARP_PDF)
-    Li = field.query(field.encode(path.si.p, vertex.facing(path.si)), found.ray.d)
+
+    def query(path, found, active):
+        more = material_of(field, path.si, path.si.bsdf(path.ray), active)
+        return field.query(field.encode(path.si.p, vertex.facing(path.si), **more), found.ray.d)
+
+    Li = query(path, found, near)
     Li = dr.select(near, Li, 0)
     if not scene_is_glossy(scene):
         return Li, sampler
@@ -286,7 +292,7 @@ def by_incident_cache(integrator, scene, field, path, found, after, sampler):
         found, sampler = paths.bounce(scene, None, path, sampler)
         after = paths.advance(path, found, integrator.depth_limit)
         ends = vertex.is_terminal(path.si, path.active) & ~found.delta & (found.bs.pdf <= SHARP_PDF)
-        beyond = field.query(field.encode(path.si.p, vertex.facing(path.si)), found.ray.d)
+        beyond = query(path, found, ends)
         after.L += dr.select(ends & after.active, path.β * found.weight * beyond, 0)
         after.active &= ~ends
         return paths.roulette(after, sampler, integrator.rr_depth)

@@ -1,6 +1,10 @@
 """Rows of the keys that all integrators with caches have, for their docstrings."""
 
+from dataclasses import asdict
+
 import mitsuba as mi
+
+from mi_neural.caches.presets import PRESETS
 
 LIGHT_SAMPLER_KEY = """
      * - light_sampler
@@ -11,17 +15,25 @@ LIGHT_SAMPLER_KEY = """
 
 
 #: Keys of whole numbers that have no default of their own.
-WHOLE = ("levels", "hashmap_size", "width", "hidden_layers", "cache_samples", "residual_samples")
+WHOLE = ("levels", "hashmap_size", "width", "hidden_layers", "cache_samples", "residual_samples", "train_records")
 
 
 class Keys:
     """A plugin's properties, which refuse a value of another kind than that of the key's default."""
 
     def __init__(self, props):
-        self.props = props
+        self.props, self.preset = props, {}
+
+    def use_preset(self, name: str, *sources) -> None:
+        """Take the constants of `sources`, data classes of :mod:`mi_neural.caches.presets`, in the place of defaults
+        from now on, if the preset is ``paper``."""
+        if name not in PRESETS:
+            raise ValueError(f"{self.plugin_name()}: preset is '{name}'; give one of: {', '.join(PRESETS)}")
+        for source in sources if name == "paper" else ():
+            self.preset |= asdict(source)
 
     def get(self, name: str, default):
-        value = self.props.get(name, default)
+        value = self.props.get(name, self.preset.get(name, default))
         if name in WHOLE and default is None and value is not None:
             default = 0
         if isinstance(default, bool):
@@ -68,6 +80,8 @@ def older_name(keys: Keys):
         raise ValueError(f"nrc: termination is '{keys['termination']}'; leave it out, paths end by spread_threshold")
     if "termination" not in keys or keys["termination"] != "auto":
         return None
+    if "preset" in keys:
+        raise ValueError(f"{name}: termination 'auto' is neural_path, which has no preset; leave one of the two out")
     mi.Log(mi.LogLevel.Warn, f"mi_neural: {name} with termination='auto' is now a plugin; type: neural_path")
     wanted = {key: keys[key] for key in keys.props.keys() if key not in WITHOUT_MEANING}
     for key in WITHOUT_MEANING:
@@ -101,7 +115,8 @@ SHARED_KEYS = (
        - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
      * - train_samples
        - |int|
-       - Training paths per frame. (Default: 4096, ``nrc`` and ``neural_path`` 2048, on a GPU 8192)
+       - Training paths per frame; -1: one for each 8x8 pixels of the film. (Default: 4096, ``nrc`` and ``neural_path``
+         2048, on a GPU 8192)
      * - train_vertices
        - |int|
        - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)
@@ -112,9 +127,17 @@ SHARED_KEYS = (
        - |float|
        - Of Adam, at the start; falls to a tenth. (Default: 0.01, ``nrc`` and ``neural_path`` 0.06, but ``nrc`` 0.01
          with a ``blend`` other than ``ema``)
+     * - epsilon
+       - |float|
+       - Of the loss, which is relative: added to the square that the error is divided by, in units of the squared mean
+         radiance of the scene. (Default: 10, ``nrc`` and ``neural_path`` 1)
      * - ema_decay
        - |float|
        - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)
+     * - ema_debiased
+       - |bool|
+       - Average over all steps so far, with weights that fall by ``ema_decay`` a step, as published; false: over the
+         last seventh of them at most. (Default: false)
      * - freeze_cache
        - |bool|
        - Do not train at all; an untrained cache predicts a constant. (Default: false)
@@ -152,6 +175,23 @@ SHARED_KEYS = (
      * - reliability_normals
        - |bool|
        - Keep statistics apart by the six main directions of the normal. (Default: false)
+     * - reliability_decay
+       - |float|
+       - What a frame leaves of the statistics before it, λ, in [0, 1). (Default: 0.9)
+     * - reliability_warm_up
+       - |int|
+       - Training frames in which σ stays 0, K. (Default: 128)
+     * - reliability_kappa
+       - |float|
+       - Gain κ of σ by how far the two predictors' ``correlation`` or ``concordance`` with the records are apart.
+         (Default: 4)
+     * - reliability_epsilon
+       - |float|
+       - ε, added to variances by ``correlation`` and ``concordance``, in units of the squared mean radiance of the
+         scene. (Default: 0.001)
+     * - reliability_resolution
+       - |int|
+       - Cells of the statistics along the longest axis of the box where records fall. (Default: 16)
      * - last_rate
        - |float|
        - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be

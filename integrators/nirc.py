@@ -11,13 +11,14 @@ import numpy as np
 from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
 from mi_neural.caches.incident import IncidentCache
+from mi_neural.caches.material import material_of
 from mi_neural.caches.outgoing import OutgoingCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.estimators import spread
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators import stopping
-from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.integrators.incident import INCIDENT_KEYS, INCIDENT_PRESETS, IncidentIntegrator
 from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.planning import SIZES
 from mi_neural.render import path as paths
@@ -45,7 +46,7 @@ class Traced:
     covered: mi.Float
 
 
-class NIRCIntegrator(CacheIntegrator):
+class NIRCIntegrator(IncidentIntegrator):
     CHOOSES_LIGHTS = True
 
     def __init__(self, props):
@@ -76,6 +77,8 @@ class NIRCIntegrator(CacheIntegrator):
             self.given["cache"] = kind
         if kind not in CONTROLS:
             return
+        self._check(self.preset == "measured", f"cache is '{kind}', but the preset '{self.preset}' is of the network; "
+                    "leave one of the two out")  # fmt: skip
         control, known = CONTROLS[kind], self.cache
         self._check(kind != "spatial_hash" or known.blend == "ema",
                     f"blend is '{known.blend}'; a spatial hash has one set of means and needs 'ema'")  # fmt: skip
@@ -174,7 +177,9 @@ class NIRCIntegrator(CacheIntegrator):
             by_chance = self.termination == "balanced"
             rule = stopping.ByChance(self.cache_samples) if by_chance else stopping.WhereWide(threshold)
             return stopping.estimate(self, scene, lights, field, path, sampler, rule)
-        features = field.encode(si.p, vertex.facing(si)) if self.cached(field) else None
+        features = None
+        if self.cached(field):
+            features = field.encode(si.p, vertex.facing(si), **material_of(field, si, bsdf, active))
 
         # ---------------- Samples with a ray: direct light, and what the ray meets ----------------
         traced, cache, sampler = self.traced_samples(scene, lights, field, features, path, bsdf, threshold, sampler)
@@ -294,7 +299,8 @@ class NIRCIntegrator(CacheIntegrator):
             after = paths.advance(path, found, self.depth_limit)
             if cached:
                 stop = stops(found.bs.pdf) & ~found.delta
-                Li_cache = field.query(field.encode(si.p, vertex.facing(si)), found.ray.d)
+                more = material_of(field, si, si.bsdf(path.ray), stop)
+                Li_cache = field.query(field.encode(si.p, vertex.facing(si), **more), found.ray.d)
                 after.L += dr.select(stop, path.β * found.weight * Li_cache, 0)
             cos_theta = dr.dot(found.si.n, found.ray.d)
             width += dr.select(found.delta, 0, spread.segment_spread(found.si.t**2, found.bs.pdf, cos_theta))
@@ -372,7 +378,9 @@ NIRCIntegrator.__doc__ = (
        - |float|
        - Constant c of the spread test a > c a_0; 0: no surface is too near. Of paths that stop it is raised to N/256
          where that is more, N being the samples a pixel. (Default: 0.01; of paths that stop 1)"""
+    + INCIDENT_KEYS
     + SHARED_KEYS
+    + INCIDENT_PRESETS
     + r"""
     Channels: ``direct``, ``cache``, ``residual`` (RGB each); with visible emission they sum to the image. ``sigma``:
     weight of the network being trained, at the first vertex; ``preference``: 1 where it exceeds 1/2. Its mean over a

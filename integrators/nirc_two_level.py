@@ -10,10 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.caches.control import ControlCache
+from mi_neural.caches.material import material_of
 from mi_neural.estimators import two_level
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators import pilot, progressive
-from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.integrators.incident import INCIDENT_KEYS, INCIDENT_PRESETS, IncidentIntegrator
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.pilot import Split
 from mi_neural.integrators.progressive import UNBIASED, Parts
@@ -31,7 +32,7 @@ EXTRA, EXTRA_LOBE, KEPT = range(paths.FREE, paths.FREE + 3)
 TOGETHER = 16
 
 
-class NIRCTwoLevelIntegrator(CacheIntegrator):
+class NIRCTwoLevelIntegrator(IncidentIntegrator):
     GRADIENT = "prb"
 
     def __init__(self, props):
@@ -275,7 +276,7 @@ class NIRCTwoLevelIntegrator(CacheIntegrator):
         queries = vertex.is_smooth(si, path.active)
         α = self.coefficient(field, si, alpha, queries)
         queries &= α > 0
-        features = field.encode(si.p, vertex.facing(si), queries)
+        features = field.encode(si.p, vertex.facing(si), queries, **material_of(field, si, bsdf, queries))
 
         def answer(bs, weight, delta):
             smooth = queries & ~delta & (bs.pdf <= SHARP_PDF)
@@ -323,7 +324,8 @@ class _FirstVertex:
             queried = vertex.is_smooth(path.si, path.active) & helps
             self.α = integrator.coefficient(field, path.si, alpha, queried)
             self.queried = queried & ((self.α > 0) | (mi.Bool(integrator.ris) & (n_cache > 1)))
-            self.features = field.encode(path.si.p, vertex.facing(path.si), self.queried)
+            more = material_of(field, path.si, self.bsdf, self.queried)
+            self.features = field.encode(path.si.p, vertex.facing(path.si), self.queried, **more)
 
     def candidate(self, lobe, direction) -> tuple:
         """(BSDF sample, its weight, whether it is of a mirror, the cache's prediction times the weight)."""
@@ -449,11 +451,11 @@ NIRCTwoLevelIntegrator.__doc__ = (
        - |bool|
        - Choose the one traced direction among the ``cache_samples`` that were queried, in proportion to f cos L plus a
          defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Was worth
-         its time in one of seven scenes measured (``mi-neural doc speed``). (Default: false)
-    """
-    + SHARED_KEYS.strip("\n")
+         its time in one of seven scenes measured (``mi-neural doc speed``). (Default: false)"""
+    + INCIDENT_KEYS
+    + SHARED_KEYS
+    + INCIDENT_PRESETS
     + r"""
-
     Channels: ``direct``, ``cache`` (its part of the sum, with α), ``residual`` (RGB each; with visible emission they
     sum to the image of mode ``unbiased``), ``alpha``; ``variance_cache``, ``variance_residual``,
     ``variance_indirect`` (RGB each): sample variances of one camera sample; over the number of samples they are

@@ -14,7 +14,7 @@ from mi_neural.integrators.common import CacheIntegrator
 
 #: The constants of a training step in the words of the plugins' keys
 KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cache_content",
-        "threshold": "spread_threshold", "roughening": "roughening"}  # fmt: skip
+        "n_records": "train_records", "threshold": "spread_threshold", "roughening": "roughening"}  # fmt: skip
 #: Rows of these keys, for the docstrings
 OUTGOING_KEYS = """
      * - inputs
@@ -22,6 +22,10 @@ OUTGOING_KEYS = """
        - What the network of outgoing radiance gets of a surface beside its position: a list of ``normal``, ``view``,
          ``albedo``, ``roughness``; ``plan``: what the scene needs. A cache that was loaded keeps its own. (Default:
          plan)
+     * - train_records
+       - |int|
+       - Most records of a training frame; of what is beyond, the last vertices of paths are left out. (Default: three
+         times ``train_samples``)
      * - train_suffix
        - |string|
        - Where training paths end: ``spread``, at the second vertex where the path has become wide, or ``full``, at
@@ -65,6 +69,8 @@ class OutgoingIntegrator(CacheIntegrator):
             "unbounded_share": props.get("unbounded_share", OutgoingTraining.unbounded_share),
             "roughening": props.get("roughening", 0.0),
             "learning_rate": self.cache.training.learning_rate,
+            "epsilon": self.cache.training.epsilon,
+            "n_records": props.get("train_records", None),
         }
 
     def outgoing_training(self) -> OutgoingTraining:
@@ -79,6 +85,9 @@ class OutgoingIntegrator(CacheIntegrator):
 
     def default_paths(self) -> int:
         return OutgoingTraining.usual_paths()
+
+    def default_epsilon(self) -> float:
+        return OutgoingTraining.epsilon
 
     def default_rate(self, blend: str) -> float:
         return OutgoingTraining.learning_rate if blend == "ema" else super().default_rate(blend)

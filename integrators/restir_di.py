@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_neural.caches import presets
 from mi_neural.estimators import reservoir
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators import restir_samples as samples
@@ -70,16 +71,25 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     ``unbiased``: the target :math:`\hat p` includes visibility and is tested anew wherever a sample goes; :math:`m_i`
     are the balance heuristic over frames and defensive pairwise weights over pixels (Bitterli 2022; Lin et al. 2022),
     which have less noise than 1/Z. Up to 5 + 2 ``spatial_samples`` rays a pixel. ``biased``: :math:`\hat p` without
-    visibility and :math:`m_i = M_i / \sum M` (1/M), 4 rays; too dark at shadows and edges.
+    visibility and :math:`m_i = M_i / \sum M` (1/M), 4 rays; too dark at shadows and edges. Without
+    ``candidate_shadow_ray`` :math:`\hat p` knows no visibility in either, and one shadow ray a pixel goes to what is
+    shown: 3 rays, and ``unbiased`` remains so.
 
     One frame is one sample a pixel. A ``render`` call with ``spp`` samples renders so many frames and returns their
     mean; their noise is correlated, so that ``restir_di`` is for one or few samples a pixel.
 
     .. pluginparameters::
 
+     * - preset
+       - |string|
+       - ``measured``: the defaults below. ``paper``: the constants as printed, of the ``nvc_lights``, too, where no
+         ``light_sampler`` is nested; keys that are given go before it. The list below has both. (Default: measured)
      * - initial_candidates
        - |int|
-       - Light samples that a pixel chooses from in each frame; the winner sends a shadow ray. (Default: 8)
+       - Light samples that a pixel chooses from in each frame. (Default: 8)
+     * - candidate_shadow_ray
+       - |bool|
+       - Whether the winner among these sends a shadow ray and is left out where that is blocked. (Default: true)
      * - candidates
        - |string|
        - ``light``: in proportion to power; ``nvc``: as the nested ``light_sampler`` chooses, ``nvc_lights`` if there is
@@ -115,6 +125,17 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
 
+    Constants of ``paper`` / ``measured``, and the measurement that led from one to the other. The former are those of
+    the ReSTIR that Bokšanský and Meister 2025 compare with (sections 3.1 and 4.1):
+
+    - ``initial_candidates``, ``history``: 8, 20 in both presets.
+    - ``spatial_radius``: 32 / by the film's height / 320x180: relMSE 0.31 / 0.23.
+    - ``candidate_shadow_ray``: true, with ``nvc`` candidates false / true / ``lamp_bays`` with these: trimmed relMSE
+      0.57 / 0.10, 63 / 79 ms a frame; ``glossy_hall`` 14 / 1.8: what is in shadow is kept and reused.
+    - ``nvc_where``: the paper has both, and recommends disoccluded / everywhere, so that ``candidates`` means all of
+      them; disoccluded costs 1.5 % of a frame (``mi-neural doc speed``).
+    - Not printed, so ours in both: ``spatial_samples``, ``normal_threshold``, ``depth_threshold``, ``combination``.
+
     State lives from call to call; another scene, sensor or film size starts anew, as ``reset()`` does by hand. A moved
     or reshaped *object* leaves a trace that fades over ``history`` frames (type ``reset()``).
 
@@ -144,6 +165,12 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props.props)
         self.hide, self.max_depth = props.get("hide_emitters", False), 2
+        self.light_sampler = light_sampler_of(props)
+        self.candidates = props.get("candidates", "light" if self.light_sampler is None else "nvc")
+        self.preset = props.get("preset", "measured")
+        more = [presets.ReSTIRWithVisibility()] if self.candidates == "nvc" else []
+        props.use_preset(self.preset, presets.ReSTIR(), *more)
+        self.candidate_shadow_ray = props.get("candidate_shadow_ray", True)
         self.initial_candidates = props.get("initial_candidates", 8)
         self.history = props.get("history", 20.0)
         self.spatial_samples = props.get("spatial_samples", 4)
@@ -151,8 +178,6 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         self.normal_threshold = props.get("normal_threshold", 0.9)
         self.depth_threshold = props.get("depth_threshold", 0.1)
         self.combination = props.get("combination", "unbiased")
-        self.light_sampler = light_sampler_of(props)
-        self.candidates = props.get("candidates", "light" if self.light_sampler is None else "nvc")
         self.nvc_where = props.get("nvc_where", "everywhere")
         self._check(self.initial_candidates >= 1,
                     f"initial_candidates is {self.initial_candidates}; it must be at least 1")  # fmt: skip
@@ -173,6 +198,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
                     "a light_sampler is nested but candidates is 'light', which does not ask it; "
                     "set candidates to 'nvc' or leave the light_sampler out")  # fmt: skip
         self.unbiased = self.combination == "unbiased"
+        # Whether the target knows visibility; else one shadow ray goes to what is shown
+        self.visible_target = self.unbiased and self.candidate_shadow_ray
         self.state = _State()
 
     def _check(self, ok: bool, message: str) -> None:
@@ -253,7 +280,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         s = self.state
         if s.chooser is None:
             s.chooser = self.light_sampler or mi.load_dict(
-                {"type": "nvc_lights" if self.candidates == "nvc" else "power_lights"}
+                {"type": "nvc_lights", "preset": self.preset} if self.candidates == "nvc" else {"type": "power_lights"}
             )
         lights = s.chooser.lights(scene, sensor)
         if lights is None:  # a single light, which light samplers do not watch
@@ -308,7 +335,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             # -------------------------- Shade -----------------------------
             f, p_light = samples.contribution(self, scene, power, si, kept.index, kept.uv, usable & (kept.W > 0))
             shown = usable & (kept.W > 0)
-            if not self.unbiased:  # else the target knows it
+            if not self.visible_target:  # else the target knows it
                 shown &= samples.visible(scene, si, p_light, shown)
             L = w_camera * (L + vertex.finite(f * kept.W, shown))
             ok = dr.all(dr.isfinite(L))

@@ -34,10 +34,11 @@ def contribution(integrator, scene, power, si, index, uv, active):
 
 
 def target(integrator, scene, power, si, index, uv, active):
-    """What light samples are kept in proportion to: the mean of the channels, of visible ones if `unbiased`."""
+    """What light samples are kept in proportion to: the mean of the channels, and 0 where something stands between if
+    `visible_target`."""
     f, p_light = contribution(integrator, scene, power, si, index, uv, active)
     value = dr.mean(f)
-    if integrator.unbiased:
+    if integrator.visible_target:
         value = dr.select(visible(scene, si, p_light, active & (value > 0)), value, 0)
     return value
 
@@ -45,7 +46,8 @@ def target(integrator, scene, power, si, index, uv, active):
 def initial(integrator, scene, lights, power, si, found, sampler, active) -> Reservoir:
     """A reservoir of this frame's own candidates, confidence 1; its W is 0 where the kept one is in shadow.
 
-    E[g W] = integral of g over what is visible (Bitterli et al. 2020, alg. 3; visibility as in alg. 5).
+    E[g W] = integral of g over what is visible (Bitterli et al. 2020, alg. 3; visibility as in alg. 5); without
+    `candidate_shadow_ray` over all.
     """
     n_candidates = integrator.initial_candidates
     n, transmits = vertex.receiver(si, si.bsdf())
@@ -79,6 +81,8 @@ def initial(integrator, scene, lights, power, si, found, sampler, active) -> Res
     else:
         kept, sampler = draw(lights, sampler, active)
     kept = replace(reservoir.finish(kept), M=dr.select(active, mi.Float(1), 0))
+    if not integrator.candidate_shadow_ray:
+        return kept
     lit = active & (kept.W > 0)
     _, p_light = contribution(integrator, scene, power, si, kept.index, kept.uv, lit)
     lit &= visible(scene, si, p_light, lit)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.caches.blend import sigma_channels
+from mi_neural.caches.material import material_of, needs_material
 from mi_neural.estimators import spread
 from mi_neural.estimators.spread import SHARP_PDF, PathSpread
 from mi_neural.render import path as paths
@@ -18,13 +19,14 @@ from mi_neural.render.kernels import end_kernel
 @dataclass
 class End:
     """Where a path has stopped: at `position`, where the cache is queried for the light from `direction` (both in world
-    space), times the throughput `β`. A PyTree."""
+    space), times the throughput `β`. `material`: what else the cache needs of the surface, by name. A PyTree."""
 
     position: mi.Point3f
     normal: mi.Vector3f
     direction: mi.Vector3f
     β: mi.Color3f
     queried: mi.Bool
+    material: dict
 
 
 class ByChance:
@@ -103,7 +105,8 @@ def estimate(integrator, scene, lights, field, path, sampler, rule):
             scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled,
             follow=lambda bs, delta: ~stops, direct=direct,
         )  # fmt: skip
-        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops)
+        material = material_of(field, path.si, bsdf, stops)
+        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops, material)
         end = dr.select(stops, here, end)
         direct_first = dr.select(is_first, path.β * found.direct, direct_first)
         path, sampler = paths.roulette(paths.advance(path, found, integrator.depth_limit), sampler, integrator.rr_depth)
@@ -114,13 +117,15 @@ def estimate(integrator, scene, lights, field, path, sampler, rule):
     n = dr.width(path.si.t)
     a_0 = spread.camera_spread(dr.square(path.length), dr.dot(path.si.n, path.ray.d))
     grown = PathSpread(dr.zeros(mi.Float, n), a_0, mi.Float(path.length), mi.Bool(path.active))
-    seen = path.L
+    material = {"material": (mi.Color3f(0), mi.Float(0))} if needs_material(field) else {}
+    zeros = (dr.zeros(kind, n) for kind in (mi.Point3f, mi.Vector3f, mi.Vector3f, mi.Color3f, mi.Bool))
+    seen, none = path.L, End(*zeros, material)
     path, end, _, direct_first, _, sampler = dr.while_loop(
-        (path, dr.zeros(End, n), grown, mi.Color3f(0), mi.Bool(True), sampler), lambda path, *_: path.active, step,
+        (path, none, grown, mi.Color3f(0), mi.Bool(True), sampler), lambda path, *_: path.active, step,
         label="paths that stop",
     )  # fmt: skip
     end_kernel(path.L, path.valid, path.depth, end, direct_first, seen)
-    features = field.encode(end.position, end.normal)
+    features = field.encode(end.position, end.normal, **end.material)
     cache = dr.select(end.queried, end.β * field.query(features, end.direction), 0)
     channels = {"direct": direct_first, "cache": cache, "residual": path.L - seen - direct_first}
     channels |= {"depth": path.depth - dr.select(end.queried, 1.0, 0.0)}  # no ray where it stopped

@@ -85,7 +85,10 @@ def many_lights_path() -> np.ndarray:
     {}, {"candidates": "nvc"},
     pytest.param({"candidates": "nvc", "nvc_where": "disoccluded"}, marks=pytest.mark.slow),
     pytest.param({**ALONE, "initial_candidates": 1}, marks=pytest.mark.slow),
-], ids=["light", "nvc", "disoccluded", "alone"])  # fmt: skip
+    {"candidates": "nvc", "candidate_shadow_ray": False},
+    pytest.param({"candidate_shadow_ray": False}, marks=pytest.mark.slow),
+    pytest.param({"candidates": "nvc", "preset": "paper", "nvc_where": "disoccluded"}, marks=pytest.mark.slow),
+], ids=["light", "nvc", "disoccluded", "alone", "nvc without a ray", "light without a ray", "preset"])  # fmt: skip
 def test_mean_is_that_of_path(keys, many_lights_path):
     scene = many_lights()
     if "candidates" in keys:

@@ -70,14 +70,14 @@ class Blend:
             return dr.select(sigma > 0.5, mi.Float(1), 0)
         return dr.select(sigma < NEGLIGIBLE, 0, dr.select(sigma > 1 - NEGLIGIBLE, 1, sigma))
 
-    def encode(self, x, n) -> tuple:
+    def encode(self, x, n, material: tuple | None = None) -> tuple:
         """What depends on the point alone, of either predictor where it counts."""
-        lifted = mi.Point3f(self.field.lift(x, n))
+        point = mi.Point3f(self.field.lift(x, n)), *self.field.surface_inputs(n, material)
         if self.grid is None:
-            return None, None, self.field.features(self.fast, lifted)
+            return None, None, self.field.features(self.fast, *point)
         sigma, n_values = self.sigma(x, n), self.field.shape.n_encoded
         return sigma, *(
-            where_active(asks, (lifted,), lambda x, w=weights: tuple(self.field.features(w, x)), n_values)
+            where_active(asks, point, lambda *point, w=weights: tuple(self.field.features(w, *point)), n_values)
             for asks, weights in ((sigma < 1, self.field.averaged), (sigma > 0, self.fast))
         )
 

@@ -62,12 +62,16 @@ class ControlVariate:
 
     # -----------------------------------------------------------------------------------------------------------------
 
-    def encode(self, x, n=None, active=True) -> list:
+    def encode(self, x, n=None, active=True, material: tuple | None = None) -> list:
         """What depends on the point alone; where not `active` nothing, at no cost if that holds for a packet."""
         if active is True:
-            return self.field.encode(x, n)
-        return list(where_active(active, (mi.Point3f(x), mi.Vector3f(n)), lambda x, n: tuple(self.field.encode(x, n)),
-                                 self.field.shape.n_encoded))  # fmt: skip
+            return self.field.encode(x, n, material=material)
+
+        def encode(x, n, *material):
+            return tuple(self.field.encode(x, n, material=material or None))
+
+        point = mi.Point3f(x), mi.Vector3f(n), *(material or ())
+        return list(where_active(active, point, encode, self.field.shape.n_encoded))
 
     def query(self, features: list, w, active=True):
         """Radiance from direction `w` at the encoded position, in [0, 1e4 scale]."""
@@ -115,7 +119,7 @@ class ControlCache(IncidentCache):
     def compare_frame(self, scene, sensor, lights, cache, seed):
         records, _ = trace_records(scene, sensor, cache, self.training, seed, lights)
         dr.eval(records)
-        answers = cache.query(cache.encode(records.position, records.normal), records.direction)
+        answers = cache.query(cache.encode(records.position, records.normal, **records.material()), records.direction)
         cache.observe(records, records.target, answers, answers)
         return cache.mean_sigma()
 

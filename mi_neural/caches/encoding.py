@@ -53,6 +53,29 @@ def one_blob(v, n_bins: int) -> list:
     return [b - a for a, b in pairwise(edges)]
 
 
+#: What a network of incident radiance can get of a surface beside position and direction, with the number of values.
+SURFACE = {"normal": 8, "albedo": 3, "roughness": 4}
+
+
+def surface_inputs(names: tuple[str, ...], n, material: tuple | None) -> list:
+    """Inputs of those `names` in `SURFACE`, in its order, for a unit normal `n` and a `material` (albedo, roughness).
+
+    The normal as one-blob of its octahedral projection (4 bins an axis), the roughness as one-blob of 1 - e^-r (4
+    bins), the albedo as it is (authors' configuration of NIRC, METHODS 1). Where nothing is known of the surface: a
+    normal along z, a grey Lambertian.
+    """
+    albedo, roughness = (mi.Color3f(0.5), mi.Float(1)) if material is None else material
+    values = []
+    if "normal" in names:
+        uv = octahedral(mi.Vector3f(0, 0, 1) if n is None else mi.Vector3f(n))
+        values += [*one_blob(uv.x, 4), *one_blob(uv.y, 4)]
+    if "albedo" in names:
+        values += list(dr.clip(albedo, 0, 1))
+    if "roughness" in names:
+        values += one_blob(1 - dr.exp(-dr.maximum(roughness, 0)), 4)
+    return values
+
+
 def record_box(points: np.ndarray, fallback_min, fallback_max, quantile: float = 0.002):
     """The box in which records fall: where light is asked for, not where geometry is.
 

@@ -38,6 +38,7 @@ class FieldShape:
     width, n_hidden       of the MLP
     n_outputs             values per query
     leak                  slope of its rectifiers below 0
+    surface               what it gets of a surface beside its position, any of `encoding.SURFACE`
     """
 
     n_levels: int = 8
@@ -50,8 +51,13 @@ class FieldShape:
     n_hidden: int = 2
     n_outputs: int = 3
     leak: float = 0.0
+    surface: tuple[str, ...] = ()
 
     def __post_init__(self):
+        object.__setattr__(self, "surface", tuple(self.surface))  # files hold lists
+        if unknown := set(self.surface) - set(encoding.SURFACE):
+            raise ValueError(f"unknown inputs: {', '.join(sorted(unknown))}; give some of: "
+                             f"{', '.join(encoding.SURFACE)}")  # fmt: skip
         for name, most in LARGEST.items():
             if not 1 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1..{most}")
@@ -69,12 +75,12 @@ class FieldShape:
 
     @property
     def n_inputs(self) -> int:
-        return self.n_features_total + (self.direction_degree + 1) ** 2
+        return self.n_first + (self.direction_degree + 1) ** 2
 
     @property
     def n_first(self) -> int:
         """Inputs, the first ones, whose share of the first layer is computed once per point."""
-        return self.n_features_total
+        return self.n_features_total + sum(encoding.SURFACE[name] for name in self.surface)
 
     @property
     def n_encoded(self) -> int:
@@ -416,10 +422,17 @@ class Field(TrainedField):
     # -------------------------------------------------------------------------------------------------------------
     # Query
 
-    def encode(self, x, n=None, averaged: bool = True) -> list:
+    def encode(self, x, n=None, averaged: bool = True, material: tuple | None = None) -> list:
         """What depends on the point alone: once per point, however many directions follow. `n`: its unit normal on the
-        side that it is seen from, see :meth:`lift`; the same at training and at queries."""
-        return self.features(self.averaged if averaged else self.current, self.lift(x, n))
+        side that it is seen from, see :meth:`lift`; `material`: its albedo and roughness, where the shape has them
+        as inputs (:func:`~mi_neural.caches.material.material_of`); both the same at training and at queries."""
+        more = self.surface_inputs(n, material)
+        return self.features(self.averaged if averaged else self.current, self.lift(x, n), *more)
+
+    def surface_inputs(self, n, material: tuple | None) -> list:
+        """What the network gets of a surface beside its position."""
+        names = getattr(self.shape, "surface", ())
+        return encoding.surface_inputs(names, n, material) if names else []
 
     def raw(self, features: list, w, averaged: bool = True):
         """The network's output over `scale`, not clamped."""
@@ -429,10 +442,10 @@ class Field(TrainedField):
         """Radiance from direction `w` (unit, away from the surface) at the encoded position; never negative."""
         return self.answer(self.averaged if averaged else self.current, features, w)
 
-    def features(self, weights: Weights, x) -> list:
-        """:meth:`encode` by any weights of this field's shape."""
+    def features(self, weights: Weights, x, *more) -> list:
+        """:meth:`encode` by any weights of this field's shape; `more`: its :meth:`surface_inputs`."""
         values = self._grid_values(weights, x)
-        return [*weights.start(values), *shortcut(values, self.GAIN)]
+        return [*weights.start([*values, *more]), *shortcut(values, self.GAIN)]
 
     def _grid_values(self, weights: Weights, x) -> list:
         return list(weights.grid(encoding.in_box(x, self.box_min, self.box_inv_extent)))
@@ -451,15 +464,16 @@ class Field(TrainedField):
     # -------------------------------------------------------------------------------------------------------------
     # Training
 
-    def predict(self, x, w, n=None):
+    def predict(self, x, w, n=None, material: tuple | None = None):
         """What :meth:`raw` gives at points with normals `n` for the weights being trained, differentiable with respect
-        to them.
+        to them. `material`: see :meth:`encode`.
 
         Call it once per :meth:`step`, before it.
         """
         weights = self.trainable()
         values = self._grid_values(weights, self.lift(x, n))
-        inputs = [*values, *encoding.direction(w, self.shape.direction_degree)]
+        surface = self.surface_inputs(n, material)
+        inputs = [*values, *surface, *encoding.direction(w, self.shape.direction_degree)]
         return mi.Color3f(*weights.differentiable(inputs)) + shortcut(values, self.GAIN) + 1
 
     def step(self, losses, learning_rate, decay):

@@ -2,8 +2,8 @@
 
 The cache learns ``L(x, ω)``: the radiance that arrives at x from ω after at least one reflection. What the next surface
 reflects is in it, next-event estimation there included; what the next surface emits is not: that is direct light at x,
-which the estimators trace. Nothing but position and direction enters the network, because incident radiance depends on
-nothing else.
+which the estimators trace. By default nothing but position and direction enters the network, because incident radiance
+depends on nothing else; the authors' network also gets normal, albedo and roughness (`FieldShape.surface`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ..render.sampling import PathSampler
 from . import encoding, loss
 from .blend import Blend
 from .field import Field, FieldShape
+from .material import material_of, needs_material
 from .places import N_PLACES
 from .records import TrainingRecords
 from .reliability import Reliability
@@ -34,6 +35,8 @@ TARGET_MAX = 1e4
 SCALE_TRIM = 1e-3
 #: Share of the training paths that start where records lay, if that place has left the view.
 WORLD_SHARE = 0.25
+#: What training lessens; the second is the authors'.
+LOSSES = ("local", "weighted")
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,16 @@ class Training:
     n_vertices       vertices of a path; it ends in the cache itself (self-training). Long suffixes carry light through
                      a closed room in a few frames and do not build on the cache's own errors (manual, measured)
     n_tail           cache queries at the end of a path
-    n_local          queries that estimate the local mean of `loss.local_relative_l2`
-    epsilon          of that loss, over the squared mean target of the scene. Where the local mean, itself a prediction,
+    loss             ``local``: `loss.local_relative_l2`; ``weighted``: `loss.weighted_relative_l2`
+    n_local          queries that estimate the local mean of the former
+    epsilon          of the loss, over the squared mean target of the scene. Where the local mean, itself a prediction,
                      is the whole norm, targets count less when it overshoots, and the cache drifts: a room lit through
                      a slit +8 to +14 % after 200 to 600 steps with 0.03, within 1 % with 10 (manual, measured)
     learning_rate    of Adam, at the start; see `rate`
     ema_decay        longest horizon of the averaged copy: 1 / (1 - ema_decay) steps
     last_rate        share of the learning rate that it falls to
+    ema_debiased     whether the averaged copy is the exponential average of all steps, freed of the bias towards its
+                     start, as published (Müller et al. 2021, METHODS 2); else it forgets the first steps, see `decay`
     """
 
     n_paths: int = 4096
@@ -61,8 +67,14 @@ class Training:
     learning_rate: float = 1e-2
     ema_decay: float = 0.99
     last_rate: float = 0.1
+    loss: str = "local"
+    ema_debiased: bool = False
 
     def __post_init__(self):
+        if self.loss not in LOSSES:
+            raise ValueError(f"loss is '{self.loss}'; give one of: {', '.join(LOSSES)}")
+        if not 0 < self.epsilon < math.inf:
+            raise ValueError(f"epsilon is {self.epsilon}; it must be a positive number")
         for name, least in (("n_paths", 1), ("n_vertices", 2), ("n_tail", 1), ("n_local", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
@@ -79,9 +91,21 @@ class Training:
         return self.learning_rate * dr.maximum(self.last_rate, 1 / (1 + step / 100))
 
     def decay(self, step):
-        """EMA decay after so many steps: the average spans the last seventh of them, at most the full
-        horizon."""
+        """EMA decay after so many steps: the average spans the last seventh of them, at most the full horizon. If
+        `ema_debiased`: ``a η_t / η_{t+1}`` with ``η_t = 1 - a^t``, a being `ema_decay`."""
+        if self.ema_debiased:
+            return _debiased(self.ema_decay, step)
         return dr.minimum(self.ema_decay, 1 - 1 / (0.15 * step + 1))
+
+
+def _debiased(a: float, step):
+    """Weight of the average before a step in the average of the weights `a`^k of all steps so far, `step` before it."""
+    if a == 0:  # powers of 0 are not finite in Dr.Jit
+        return 0.0
+    if a == 1:
+        return 1 - 1 / (step + 1)
+    filled = 1 - dr.power(a, step)
+    return a * filled / (1 - a + a * filled)
 
 
 def trace_records(
@@ -94,12 +118,24 @@ def trace_records(
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
     def from_cache(si, bsdf, active, sampler):
-        return reflect(field, field.encode(si.p, vertex.facing(si)), si, bsdf, training.n_tail, sampler, active)
+        features = field.encode(si.p, vertex.facing(si), **material_of(field, si, bsdf, active))
+        return reflect(field, features, si, bsdf, training.n_tail, sampler, active)
 
-    plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False, world_share=WORLD_SHARE)
+    plan = Suffixes(
+        training.n_paths, training.n_vertices, surfaces=needs_material(field), world_share=WORLD_SHARE,
+        densities=training.loss == "weighted",
+    )  # fmt: skip
     query = from_cache if field is not None else None
     traced = trace_training_paths(scene, sensor, sampler, plan, query, lights, places)
-    return traced.incident, traced.n_bad[1]
+    records = traced.incident
+    if plan.surfaces:
+        surface = traced.outgoing.surface
+        records.albedo, records.roughness = surface.albedo, surface.roughness
+    if plan.densities:
+        finite = dr.all(dr.isfinite(traced.weight)) & dr.isfinite(traced.pdf)
+        records.valid &= finite
+        records.weight, records.pdf = dr.select(finite, traced.weight, 0), dr.select(finite, traced.pdf, 0)
+    return records, traced.n_bad[1]
 
 
 def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
@@ -148,18 +184,15 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
         mean_target = dr.sum(loss.luminance(y)) / n_valid
         field.mean = dr.lerp(mean_target, field.mean, decay)
         dr.eval(y, field.mean)
-        averaged = field.query(field.encode(records.position, records.normal), records.direction) if blend else None
+        averaged, material = None, records.material()
+        if blend:
+            averaged = field.query(field.encode(records.position, records.normal, **material), records.direction)
         dr.schedule(averaged)
 
-    p = field.predict(records.position, records.direction, records.normal)
-    with dr.suspend_grad():
-        sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
-        features = field.encode(records.position, records.normal, averaged=False)  # looked up as the prediction's
-        mean_local = local_mean(field, features, records, training.n_local, sampler)
+    p = field.predict(records.position, records.direction, records.normal, **material)
     prediction = dr.detach(p)
-    dr.schedule(prediction, mean_local)  # or the gradient by way of the shortcut would ask for the mean again
-    epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
-    error = loss.local_relative_l2(p, y, mean_local, epsilon)
+    dr.schedule(prediction)
+    error = _errors(field, records, training, seed, p, y, material)
     total = field.step(dr.select(records.valid, error, 0) / n_valid, learning_rate, decay)
     total = dr.select(field.averaged.finite(), total, math.nan)  # queries would hide it
     if blend:
@@ -168,6 +201,20 @@ def learn(cache: Field | Blend, records: TrainingRecords, training: Training, se
             blend.refresh()
     mean_prediction = dr.sum(dr.select(records.valid, dr.abs(loss.luminance(prediction)), 0)) / n_valid
     return total, mean_target, mean_prediction
+
+
+def _errors(field: Field, records: TrainingRecords, training: Training, seed, p, y, material: dict):
+    """The loss of each record, for predictions `p` and targets `y` over `scale`."""
+    if training.loss == "weighted":
+        return loss.weighted_relative_l2(p, y, records.weight, records.pdf, training.epsilon)
+    with dr.suspend_grad():
+        sampler = PathSampler.make(dr.arange(mi.UInt32, dr.width(y)), seed)
+        # Looked up as the prediction's
+        features = field.encode(records.position, records.normal, averaged=False, **material)
+        mean_local = local_mean(field, features, records, training.n_local, sampler)
+    dr.schedule(mean_local)  # or the gradient by way of the shortcut would ask for the mean again
+    epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
+    return loss.local_relative_l2(p, y, mean_local, epsilon)
 
 
 class IncidentCache(Trainer):

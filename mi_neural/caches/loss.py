@@ -26,3 +26,9 @@ def local_relative_l2(p, y, local_mean, epsilon):
     right; positions weigh as a relative error in the image does.
     """
     return dr.squared_norm(p - y) / (dr.square(dr.detach(local_mean)) + epsilon)
+
+
+def weighted_relative_l2(p, y, weight, pdf, epsilon):
+    """``pdf |t p - t y|² / (mean_rgb(stopgrad t p)² + ε)``, t being the `weight` f cos/p of the direction's BSDF sample
+    and `pdf` its density: the error counts as the pixel will see it (authors' configuration of NIRC, METHODS 1)."""
+    return pdf * relative_l2(weight * p, weight * y, epsilon)

@@ -319,7 +319,7 @@ def _sanitize(usable, x, n, w, albedo, roughness) -> tuple:
 
 @dataclass(frozen=True)
 class OutgoingTraining(Training):
-    """Constants of one training step; those of :class:`~mi_neural.caches.incident.Training`, and
+    """Constants of one training step; those of :class:`~mi_neural.caches.incident.Training` but `loss`, and
 
     n_paths           training paths. In equal time half as many at twice the rate learn as well or better (manual,
                       measured)
@@ -352,6 +352,8 @@ class OutgoingTraining(Training):
         for name in ("unbounded_share", "world_share", "roughening"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in [0, 1]")
+        if self.n_records is not None and self.n_records < 1:
+            raise ValueError(f"n_records is {self.n_records}; it must be at least 1")
         if not self.threshold >= 0:
             raise ValueError(f"threshold is {self.threshold}; it must be 0 or more")
 
@@ -366,8 +368,13 @@ class OutgoingTraining(Training):
         """The constants that incident and outgoing training have in common, `RATE` times its learning rate, and
         `chosen` others."""
         common = {"n_paths": shared.n_paths, "n_vertices": shared.n_vertices, "ema_decay": shared.ema_decay,
-                  "last_rate": shared.last_rate, "learning_rate": RATE * shared.learning_rate}  # fmt: skip
+                  "last_rate": shared.last_rate, "learning_rate": RATE * shared.learning_rate,
+                  "ema_debiased": shared.ema_debiased}  # fmt: skip
         return cls(**(common | chosen))
+
+    def decay(self, step):
+        # The field frees its average of the bias by itself
+        return self.ema_decay if self.ema_debiased else super().decay(step)
 
     def paths(self, probe: bool = False, twins: bool = False) -> Suffixes:
         """How training paths run; those of the `probe` end in nothing, for want of a cache."""

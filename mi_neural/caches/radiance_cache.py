@@ -15,10 +15,11 @@ from ..render.frozen import undisturbed
 from .field import CacheFileError
 from .optimizer import own_copy
 from .outgoing import OutgoingField, OutgoingShape
+from .presets import PRESETS, RadianceCacheGuide, RadianceCaching
 from .voxels import check_box
 
 #: Defaults of the guide.
-LEARNING_RATE, WEIGHT_SMOOTHING = 0.002, 0.99
+LEARNING_RATE, WEIGHT_SMOOTHING = RadianceCacheGuide.learning_rate, RadianceCacheGuide.ema_decay
 
 
 class DispatchFlags(enum.Flag):
@@ -82,7 +83,8 @@ class RadianceCache:
 
     Parameters: `max_inference_sample_count`, `max_training_sample_count` (per dispatch), `box_min`, `box_max` (the
     scene's, world space; what lies outside is moved to its surface), `scale` (see :class:`OutgoingField`; None:
-    measured on the first training samples, and until then predictions are 0), `shape`, `seed`.
+    measured on the first training samples, and until then predictions are 0), `shape`, `seed`, `preset` (``measured``
+    or ``paper``, see below; a `shape` goes before it). Raises ValueError for values that make no sense.
 
     Points are :class:`CacheInput` (answers: `mi.Color3f`) or NumPy arrays (n, 11) (answers: (n, 3) of 32 bit). Unlike
     in the guide, targets and predictions are whole radiance: the cache divides by the albedo and multiplies it back.
@@ -93,6 +95,15 @@ class RadianceCache:
                            train_inputs=..., train_targets=...)
 
     See :func:`self_training_frame` for a whole frame.
+
+    Constants of ``paper`` / ``measured``, and the measurement that led from one to the other:
+
+    - learning rate 0.002, weight smoothing 0.99 (the guide), inputs position, normal, view direction, albedo,
+      roughness, ε of the loss 0.01 (Müller et al. 2021): the same in both.
+    - network: 2 hidden layers of 64 (Müller et al. 2021, with a hash grid; the guide prints none) / of 32; not
+      measured.
+    - not printed in the guide, so ours in both: the network's kind, its loss, the grid, the initial weights. Most
+      training samples of a dispatch, 1 to 5 % of the pixels in the guide, are `max_training_sample_count`.
     """
 
     #: Smallest size that buffers are padded to: work is recorded once per size (half, quarter, ... of the maximum).
@@ -100,8 +111,12 @@ class RadianceCache:
 
     def __init__(
         self, max_inference_sample_count: int, max_training_sample_count: int, box_min=(0, 0, 0), box_max=(1, 1, 1),
-        *, scale: float | None = None, shape: OutgoingShape | None = None, seed: int = 0,
+        *, scale: float | None = None, shape: OutgoingShape | None = None, seed: int = 0, preset: str = PRESETS[0],
     ):  # fmt: skip
+        if preset not in PRESETS:
+            raise ValueError(f"preset is {preset!r}; give one of: {', '.join(PRESETS)}")
+        if preset == "paper" and shape is None:
+            shape = OutgoingShape(width=RadianceCaching.width, n_hidden=RadianceCaching.hidden_layers)
         for name, value in (
             ("max_inference_sample_count", max_inference_sample_count),
             ("max_training_sample_count", max_training_sample_count),

@@ -19,6 +19,11 @@ class TrainingRecords:
     normal     unit shading normals, on the side that the path came from
     target     estimates of the radiance that arrives at `position` from `direction` after at least one reflection
     valid      mask
+
+    Where the loss or the network's inputs need them, else None:
+
+    weight, pdf        ``f cos/p`` of the BSDF sample that `direction` is, and its density p (solid angle)
+    albedo, roughness  of the surface, see :func:`~mi_neural.render.surface.surface_of`
     """
 
     position: mi.Point3f
@@ -26,6 +31,14 @@ class TrainingRecords:
     normal: mi.Vector3f
     target: mi.Color3f
     valid: mi.Bool
+    weight: mi.Color3f | None = None
+    pdf: mi.Float | None = None
+    albedo: mi.Color3f | None = None
+    roughness: mi.Float | None = None
+
+    def material(self) -> dict:
+        """Keywords for the ``encode`` of a field that has the material as an input; none where it is not known."""
+        return {} if self.albedo is None else {"material": (self.albedo, self.roughness)}
 
 
 def empty_records(n: int) -> TrainingRecords:
@@ -81,7 +94,7 @@ def packed(records, n: int):
         if is_dataclass(to):
             for field in fields(to):
                 put(getattr(to, field.name), getattr(value, field.name))
-        else:
+        elif to is not None:
             dr.scatter(to, value, slot, fits)
 
     put(out, records)

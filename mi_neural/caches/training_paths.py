@@ -43,6 +43,7 @@ class Suffixes:
     content         see `CONTENTS`; what the cache holds that is queried at the ends
     twins           whether the paths 2k and 2k + 1 start with the same ray
     surfaces        whether records of outgoing radiance are wanted
+    densities       whether the densities of BSDF rays are
     """
 
     n_paths: int
@@ -55,6 +56,7 @@ class Suffixes:
     content: str = "indirect"
     twins: bool = False
     surfaces: bool = True
+    densities: bool = False
 
 
 @dataclass
@@ -66,6 +68,7 @@ class PathRecords:
     direct     direct light that the vertex reflects towards its viewer, traced
     weight     ``f cos/p`` of the BSDF ray that left it
     stops      whether the vertex that the ray met is where a pixel's path would end in the cache
+    pdf        density p of that BSDF ray (solid angle); of no meaning where densities were not asked for
     n_bad      how many outgoing and incident records were left out because their targets were not finite
     """
 
@@ -74,6 +77,7 @@ class PathRecords:
     direct: mi.Color3f
     weight: mi.Color3f
     stops: mi.Bool
+    pdf: mi.Float
     n_bad: tuple
 
 
@@ -115,6 +119,7 @@ class Vertices:
     estimated  next-event estimation at the vertex, weighed by MIS; L_nee
     weight     ``f cos/p`` of that BSDF ray, whose direction and lobe follow: whether the lobe is smooth
     stops      see :class:`PathRecords`
+    pdf        density of that BSDF ray, if asked for
     """
 
     records: OutgoingRecords
@@ -124,12 +129,14 @@ class Vertices:
     direction: mi.Vector3f
     smooth: mi.Bool
     stops: mi.Bool
+    pdf: mi.Float
 
     @classmethod
-    def empty(cls, size: int) -> Vertices:
+    def empty(cls, size: int, densities: bool = False) -> Vertices:
         colours = (dr.zeros(mi.Color3f, size) for _ in range(3))
         direction, smooth, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
-        return cls(empty_surfaces(size), *colours, direction, smooth, stops)
+        pdf = dr.zeros(mi.Float, size if densities else 1)
+        return cls(empty_surfaces(size), *colours, direction, smooth, stops, pdf)
 
     def keep(self, i, si, found: paths.Bounce, terminal, surface) -> None:
         """Write entries `i`; `surface` is None where only positions and normals are wanted."""
@@ -174,7 +181,7 @@ class _Tracer:
         plan, n_kept = self.plan, self.plan.n_vertices - 1
         lane = dr.arange(mi.UInt32, plan.n_paths)
         unbounded = lane < plan.n_unbounded
-        vertices = Vertices.empty(plan.n_paths * n_kept)
+        vertices = Vertices.empty(plan.n_paths * n_kept, plan.densities)
 
         def step(k, path, spread, ends, n_rough, open_, sampler):
             i = k * plan.n_paths + lane
@@ -182,6 +189,8 @@ class _Tracer:
             surface = self.surface(path, path.active) if plan.surfaces else None
             found, sampler = self.bounce(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
             vertices.keep(i, path.si, found, terminal, surface)
+            if plan.densities:
+                dr.scatter(vertices.pdf, found.bs.pdf, i)
             path = paths.advance(path, found)
             open_ = mi.Bool(path.active)
             if plan.surfaces:
@@ -292,4 +301,4 @@ def trace_training_paths(
     incident = TrainingRecords(surface.position, vertices.direction, surface.normal, arrived, vertices.smooth)
     n_bad = n_bad, leave_out_nonfinite(incident)
     direct = vertices.estimated + vertices.weight * vertices.emitted
-    return PathRecords(records, incident, direct, vertices.weight, vertices.stops, n_bad)
+    return PathRecords(records, incident, direct, vertices.weight, vertices.stops, vertices.pdf, n_bad)

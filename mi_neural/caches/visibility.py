@@ -84,7 +84,7 @@ class VisibilityField(TrainedField):
         self.current, self.averaged = Weights(self.shape, self.seed), Weights(self.shape, self.seed)
         if self.he:
             for weights in (self.current, self.averaged):
-                _initialize_he(weights, self.seed)
+                initialize_he(weights, self.seed)
         self.stride, self.steps = Stride.make(), 0
         self._attach_optimizer()
         dr.make_opaque(self.box_min, self.box_inv_extent)
@@ -134,7 +134,7 @@ class VisibilityField(TrainedField):
         return loss
 
 
-def _initialize_he(weights: Weights, seed: int) -> None:
+def initialize_he(weights: Weights, seed: int) -> None:
     """Normal weights of variance 2 / inputs, and no biases (He et al. 2015, eq. 10)."""
     rng = np.random.default_rng(seed)
     for name, tensor in list(weights.mlp.items()):
