@@ -37,7 +37,7 @@ OUTGOING_KEYS = """
      * - unbounded_share
        - |float|
        - Share of the training paths that run on to their natural end, without self-training: more where light enters
-         by many reflections, and the cache starts too dark. (Default: 0.25)
+         by many reflections, and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised`` 0.5)
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first
@@ -66,7 +66,7 @@ class OutgoingIntegrator(CacheIntegrator):
             "threshold": self.spread_threshold if math.isfinite(self.spread_threshold) else 0.01,
             "suffix": props.get("train_suffix", "spread"),
             "world_share": props.get("world_share", 0.25),
-            "unbounded_share": props.get("unbounded_share", OutgoingTraining.unbounded_share),
+            "unbounded_share": props.get("unbounded_share", self.default_unbounded(props)),
             "roughening": props.get("roughening", 0.0),
             "learning_rate": self.cache.training.learning_rate,
             "epsilon": self.cache.training.epsilon,
@@ -85,6 +85,10 @@ class OutgoingIntegrator(CacheIntegrator):
 
     def default_paths(self) -> int:
         return OutgoingTraining.usual_paths()
+
+    def default_unbounded(self, props) -> float:
+        """Share of training paths without an end in the cache where no key says it."""
+        return OutgoingTraining.unbounded_share
 
     def default_epsilon(self) -> float:
         return OutgoingTraining.epsilon

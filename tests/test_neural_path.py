@@ -250,6 +250,12 @@ def test_cache_at_the_first_surface_is_nrc_with_threshold_zero(trained, box, tmp
     assert image[..., 4].max() == 1, "no path was traced"
 
 
+def test_denoised_images_learn_from_more_paths_without_an_end():
+    shares = [mi.load_dict({"type": "neural_path", **keys}).cache.training.unbounded_share
+              for keys in ({}, {"denoised": True}, {"denoised": True, "unbounded_share": 0.1})]  # fmt: skip
+    assert shares == [0.25, 0.5, 0.1]
+
+
 @pytest.mark.parametrize("denoised", [False, True])
 def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
