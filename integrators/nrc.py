@@ -9,7 +9,7 @@ from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix
 from mi_neural.render.kernels import end_kernel
-from mi_neural.render.surface import scene_is_glossy, surface_of
+from mi_neural.render.surface import scene_is_glossy
 
 
 class NRCIntegrator(OutgoingIntegrator):
@@ -38,18 +38,18 @@ class NRCIntegrator(OutgoingIntegrator):
         """E[L] = path tracing up to the vertex where the spread exceeds that of the pixel, and the cache there."""
         cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
 
-        def stop(si, spread, smooth, first, sampler):
+        def stop(path, spread, smooth, first, sampler):
             wide = smooth & spread.exceeds(self.spread_threshold)
             never = mi.Bool(False)
             return mi.Float(0), *((wide, never) if self.content == "reflected" else (never, wide)), sampler
 
         looks = cached and bool({"cache", "density"} & set(self.channels))
         end, sampler = prefix.trace(
-            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, looks
+            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, looks, self.walk
         )
         path, cache, shown = end.path, mi.Color3f(0), sigma_channels(None, None, None)
         if cached:
-            surface = surface_of(path.si, path.si.bsdf(path.ray), end.queried, glossy)
+            surface = self.walk.surface(path, end.queried, glossy)
             end_kernel(path.L, path.β, path.valid, path.depth, end.queried, surface, end.first, end.β_first)
             cache = dr.select(end.queried, path.β * field.query(*surface.inputs()), 0)
             shown = sigma_channels(field, surface.position, surface.normal)

@@ -93,7 +93,8 @@ def trace_records(
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
-    def from_cache(si, bsdf, active, sampler):
+    def from_cache(path, active, sampler):
+        si, bsdf = path.si, path.si.bsdf(path.ray)
         return reflect(field, field.encode(si.p, vertex.facing(si)), si, bsdf, training.n_tail, sampler, active)
 
     plan = Suffixes(training.n_paths, training.n_vertices, surfaces=False, world_share=WORLD_SHARE)
