@@ -154,10 +154,16 @@ NeuralPathIntegrator.__doc__ = (
     (RGB: the outgoing cache seen directly at the first vertex), ``share`` (its weight there), ``depth`` (segments up to
     the end of the path), ``density`` (training records per frame near the first vertex).
 
-    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``plain_path``), polarization, spectral rendering, ``blend`` (use ``nrc``).
+    In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
+    scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
+    the throughput. The spread of a path has no angle there. Training paths start at the camera alone, whatever
+    ``world_share``, and ``roughening`` is refused.
 
-    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
+    out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
+    polarization, spectral rendering, ``blend`` (use ``nrc``).
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
 
     .. tabs::

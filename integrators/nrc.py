@@ -123,11 +123,17 @@ NRCIntegrator.__doc__ = (
     of the network being trained where the cache was queried, and 1 where it exceeds 1/2). ``statistics()["loss"]`` is
     the loss of the latest training frame, ``cache.history`` holds those of all.
 
-    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``plain_path``), polarization, spectral rendering, and a limit to the number of bounces
-    inside the cache (use ``path``). Sharp reflections seen by way of a rough surface are blurred.
+    In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
+    scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
+    the throughput. The spread of a path has no angle there. Training paths start at the camera alone, whatever
+    ``world_share``, and ``roughening`` is refused.
 
-    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
+    out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
+    polarization, spectral rendering, and a limit to the number of bounces inside the cache (use ``path``). Sharp
+    reflections seen by way of a rough surface are blurred.
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
 
     .. tabs::
