@@ -41,7 +41,8 @@ def test_objects_have_unique_ids_and_references_meet_them(name):
     assert all(e.get("id") for e in root.iter("emitter"))
 
     references = {e.get("id") for e in root.iter("ref")}
-    assert references == {e.get("id") for e in (*root.findall("bsdf"), *root.findall("medium"))}  # none unknown, none unused
+    named = {e.get("id") for e in (*root.findall("bsdf"), *root.findall("medium"))}
+    assert references == named  # none unknown, none unused
 
 
 @pytest.mark.parametrize("name", NAMES)
