@@ -8,11 +8,18 @@ from contextlib import nullcontext
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.checks import check_film, refuse_medium_of, sensor_of
+from mi_neural.integrators.checks import (
+    check_film,
+    check_lights_in_media,
+    check_phase_functions,
+    refuse_medium_of,
+    sensor_of,
+)
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
 from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording, undisturbed
+from mi_neural.render.media import Media
 from mi_neural.render.sampling import PathSampler
 
 
@@ -43,6 +50,8 @@ class FilmIntegrator(mi.SamplingIntegrator):
         self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
         self._check(self.rr_depth >= 1, f"rr_depth is {self.rr_depth}; it must be at least 1")
         self.channels: list[str] = []
+        self.media: Media | None = None  # of the bound scene
+        self.camera_medium, self.camera_medium_id = None, -1
         self.film_state = _FilmState()
 
     def _check(self, ok: bool, message: str) -> None:
@@ -76,6 +85,21 @@ class FilmIntegrator(mi.SamplingIntegrator):
         `lights` chooses lights (None: the scene itself), `field` is the cache that is queried (None: there is none).
         """
         raise NotImplementedError(f"{type(self).__name__} must define estimate()")
+
+    def bind_media(self, scene, sensor, known: bool) -> None:
+        """Look for media in a scene, which is `known` or another one, and where the camera is in one."""
+        medium = sensor.get_medium() if hasattr(sensor, "get_medium") else None
+        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
+            self.film_state.forget_scene()
+            self.media = Media.of(scene, [sensor])
+            check_phase_functions(scene, sensor, self.plugin)
+        elif self.media is not None and self.media.edited():
+            self.film_state.forget_scene()
+        if self.media is None:
+            return
+        if self.bound_lights is not None:
+            check_lights_in_media(self.bound_lights, self.plugin)
+        self.camera_medium, self.camera_medium_id = medium, -1 if medium is None else medium.ptr
 
     @property
     def bound_lights(self):
@@ -214,7 +238,7 @@ class _FilmState:
         self.passes = Passes()
         self.planned_spp: int | None = None
         self.nonfinite: list = []
-        self.n_bound = 0
+        self.n_bound = self.n_forgotten = 0
         self.entered = False  # whether Mitsuba's own render() is under way, which calls sample()
         self._estimate = None
         self._records: bool | None = None
@@ -236,6 +260,7 @@ class _FilmState:
         """Forget what was recorded for the scene that was bound."""
         self.passes.clear()
         self._records = None
+        self.n_forgotten += 1
 
     def count(self, n_bad) -> None:
         """Take in how many samples of a pass were not finite."""

@@ -20,8 +20,8 @@ FILM_VALUES = 16
 
 #: What renders participating media.
 WITH_MEDIA = (
-    'media are not modelled by it; use <integrator type="plain_path"/>, with a light sampler or without, or '
-    '<integrator type="volpath"/>'
+    'media are not modelled by it; use <integrator type="plain_path"/> or <integrator type="neural_path"/>, with a '
+    'light sampler or without, or <integrator type="volpath"/>'
 )
 
 
@@ -77,10 +77,15 @@ def check_gradients_in_media(scene, plugin: str) -> None:
     """Refuse gradients in a scene with participating media, if derivatives with respect to it are wanted."""
     params = mi.traverse(scene)
     if any(dr.grad_enabled(value) for value in (parameters.read(params, key) for key in params.keys())):
-        raise RuntimeError(
-            f"{plugin}: there are no gradients in scenes with participating media; use Mitsuba's own, "
-            "mi.render(scene, params, integrator=mi.load_dict({'type': 'prbvolpath'}))"
-        )
+        raise no_gradients_in_media(plugin)
+
+
+def no_gradients_in_media(plugin: str) -> RuntimeError:
+    """The error where gradients are wanted in a scene with participating media."""
+    return RuntimeError(
+        f"{plugin}: there are no gradients in scenes with participating media; use Mitsuba's own, "
+        "mi.render(scene, params, integrator=mi.load_dict({'type': 'prbvolpath'}))"
+    )
 
 
 def _check_emitter(emitter, plugin: str) -> None:

@@ -164,7 +164,7 @@ class CacheIntegrator(LearningIntegrator):
     def bind(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
         view = self._view(sensor)
-        known = self.state.bound.parts
+        known, same = self.state.bound.parts, self.state.bound.knows(scene)
         if self.state.bound.changed(scene) or self.state.signature is None:
             try:
                 self._begin(scene, known is not self.state.bound.parts)
@@ -178,6 +178,8 @@ class CacheIntegrator(LearningIntegrator):
             learn = (train and not self.state.image_open) or not self.state.measured
             with dr.suspend_grad():
                 self.state.lights = self.light_sampler.lights(scene, view, train=learn)
+        if self.renders_media:
+            self.bind_media(scene, sensor, same)
         self.cache.recordable = self.film_state.scene_records(scene)
         if not self.needs_cache:
             if not self.state.measured:
@@ -198,7 +200,7 @@ class CacheIntegrator(LearningIntegrator):
 
     def _begin(self, scene, is_another: bool) -> None:
         """Begin with a scene: refuse it, or see what it is."""
-        check_scene(scene, self.plugin)
+        check_scene(scene, self.plugin, self.renders_media)
         if self.state.signature is not None:
             self.reset()
         signature = scene_signature(scene)
@@ -217,7 +219,7 @@ class CacheIntegrator(LearningIntegrator):
     def make_plan(self, scene, sensor=0) -> plan.ScenePlan:
         """What will be built in `scene`, what is left out, and why. Changes nothing."""
         sensor = self._sensor(scene, sensor)
-        check_scene(scene, self.plugin)
+        check_scene(scene, self.plugin, self.renders_media)
         return planning.make_plan(self, scene, sensor)
 
     def _publish(self) -> None:

@@ -24,10 +24,12 @@ import mitsuba as mi
 from mi_neural.caches.material import material_of
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators.base import as_seed
+from mi_neural.integrators.checks import no_gradients_in_media
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import PACKET, PASS_SAMPLES, Area, Samples, camera_rays
 from mi_neural.render.frozen import LOCK, can_freeze, is_recording, undisturbed
+from mi_neural.render.media import media_of
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
 #: Values of the key ``gradient``.
@@ -94,6 +96,8 @@ def render_backward(integrator, scene, params, grad_in, sensor=0, seed=0, spp=0)
 def _by_cache(integrator, scene, params, sensor) -> bool:
     """Whether derivatives come from the cache. What stands against it, or is left out, is named once."""
     plugin, state = integrator.plugin, integrator.state
+    if media_of(scene, [sensor]):
+        raise no_gradients_in_media(plugin)
     if integrator.channels:
         state.say_once(f"{plugin}: the channels {', '.join(integrator.channels)} have no gradient")
     if integrator.nested_sampler is not None or state.lights is not None:

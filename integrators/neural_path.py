@@ -10,9 +10,9 @@ from mi_neural.caches.blend import where_active
 from mi_neural.caches.outgoing import OutgoingShape
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
-from mi_neural.render import prefix, vertex
+from mi_neural.render import prefix
 from mi_neural.render.kernels import end_kernel
-from mi_neural.render.surface import scene_is_glossy, surface_of
+from mi_neural.render.surface import scene_is_glossy
 
 #: Queries a camera sample, at its first surface and at its end.
 QUERIES = 2.0
@@ -76,12 +76,12 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         if cached and self.denoised:
             threshold = dr.maximum(threshold, denoised_threshold(field.grid.ratio, n_samples / DENOISED_SAMPLES))
 
-        def stop(si, spread, smooth, first, sampler):
-            share = field.grid.share(si.p, vertex.facing(si), n_samples, smooth)
+        def stop(path, spread, smooth, first, sampler):
+            share = field.grid.share(*self.walk.place(path), n_samples, smooth)
             return share, smooth & ~first & spread.exceeds(threshold), mi.Bool(False), sampler
 
         end, sampler = prefix.trace(
-            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=cached
+            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=cached, walk=self.walk
         )
         path, zero = end.path, mi.Color3f(0)
         channels = {"traced": path.L, "cached": zero, "cache": zero, "density": mi.Float(0),
@@ -95,7 +95,7 @@ class NeuralPathIntegrator(OutgoingIntegrator):
 
         shows = bool({"cache", "density"} & set(self.channels))
         seen = (dr.max(end.β_first) > 0) & ((end.share > 0) | shows)
-        last = surface_of(path.si, path.si.bsdf(path.ray), end.ends, glossy)
+        last = self.walk.surface(path, end.ends, glossy)
         end_kernel(path.L, path.β, path.valid, path.depth, end.ends, end.share, end.β_first, end.first, last)
         at_first = end.β_first * query(seen, end.first)
         at_end = path.β * query(end.ends, last)
@@ -160,10 +160,16 @@ NeuralPathIntegrator.__doc__ = (
     (RGB: the outgoing cache seen directly at the first vertex), ``share`` (its weight there), ``depth`` (segments up to
     the end of the path), ``density`` (training records per frame near the first vertex).
 
-    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``plain_path``), polarization, spectral rendering, ``blend`` (use ``nrc``).
+    In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
+    scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
+    the throughput. The spread of a path has no angle there. Training paths start at the camera alone, whatever
+    ``world_share``, and ``roughening`` is refused.
 
-    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
+    out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
+    polarization, spectral rendering, ``blend`` (use ``nrc``).
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
 
     .. tabs::

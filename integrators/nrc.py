@@ -10,7 +10,7 @@ from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix
 from mi_neural.render.kernels import end_kernel
-from mi_neural.render.surface import scene_is_glossy, surface_of
+from mi_neural.render.surface import scene_is_glossy
 
 
 class NRCIntegrator(OutgoingIntegrator):
@@ -42,18 +42,18 @@ class NRCIntegrator(OutgoingIntegrator):
         """E[L] = path tracing up to the vertex where the spread exceeds that of the pixel, and the cache there."""
         cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
 
-        def stop(si, spread, smooth, first, sampler):
+        def stop(path, spread, smooth, first, sampler):
             wide = smooth & spread.exceeds(self.spread_threshold)
             never = mi.Bool(False)
             return mi.Float(0), *((wide, never) if self.content == "reflected" else (never, wide)), sampler
 
         looks = cached and bool({"cache", "density"} & set(self.channels))
         end, sampler = prefix.trace(
-            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, looks
+            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, looks, self.walk
         )
         path, cache, shown = end.path, mi.Color3f(0), sigma_channels(None, None, None)
         if cached:
-            surface = surface_of(path.si, path.si.bsdf(path.ray), end.queried, glossy)
+            surface = self.walk.surface(path, end.queried, glossy)
             end_kernel(path.L, path.β, path.valid, path.depth, end.queried, surface, end.first, end.β_first)
             cache = dr.select(end.queried, path.β * field.query(*surface.inputs()), 0)
             shown = sigma_channels(field, surface.position, surface.normal)
@@ -162,11 +162,17 @@ NRCIntegrator.__doc__ = (
     of the network being trained where the cache was queried, and 1 where it exceeds 1/2). ``statistics()["loss"]`` is
     the loss of the latest training frame, ``cache.history`` holds those of all.
 
-    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``plain_path``), polarization, spectral rendering, and a limit to the number of bounces
-    inside the cache (use ``path``). Sharp reflections seen by way of a rough surface are blurred.
+    In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
+    scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
+    the throughput. The spread of a path has no angle there. Training paths start at the camera alone, whatever
+    ``world_share``, and ``roughening`` is refused.
 
-    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
+    out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
+    polarization, spectral rendering, and a limit to the number of bounces inside the cache (use ``path``). Sharp
+    reflections seen by way of a rough surface are blurred.
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
 
     .. tabs::

@@ -11,6 +11,7 @@ from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining
 from mi_neural.integrators import gradients
 from mi_neural.integrators.common import CacheIntegrator
+from mi_neural.render.walk import SURFACES, MediaWalk
 
 #: The constants of a training step in the words of the plugins' keys
 KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cache_content",
@@ -48,10 +49,12 @@ class OutgoingIntegrator(CacheIntegrator):
     """Base of the integrators that train a cache of outgoing radiance."""
 
     CHOOSES_LIGHTS = True
+    renders_media = True
     content = "reflected"
 
     def __init__(self, props):
         super().__init__(props)
+        self.walk = SURFACES
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
         inputs = props.get("inputs", "plan")
@@ -82,6 +85,17 @@ class OutgoingIntegrator(CacheIntegrator):
             for name, key in KEYS.items():
                 message = message.replace(f"{name} is", f"{key} is")
             raise ValueError(f"{self.plugin}: {message}") from None
+
+    def bind_media(self, scene, sensor, known: bool) -> None:
+        known_media, known_camera, forgotten = self.media, self.camera_medium_id, self.film_state.n_forgotten
+        super().bind_media(scene, sensor, known)
+        another = self.media is not known_media or self.camera_medium_id != known_camera
+        if another or (self.media is not None and self.film_state.n_forgotten > forgotten):
+            self._check(self.media is None or self.cache.training.roughening == 0,
+                        "roughening works in scenes without participating media; leave it out")  # fmt: skip
+            self.walk = SURFACES if self.media is None else MediaWalk(self.media, self.camera_medium)
+            self.cache.walk = self.walk
+            self.cache.clear_recordings()
 
     def default_paths(self) -> int:
         return OutgoingTraining.usual_paths()

@@ -5,13 +5,12 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.checks import check_gradients_in_media, check_lights_in_media, check_phase_functions
+from mi_neural.integrators.checks import check_gradients_in_media
 from mi_neural.integrators.keys import LIGHT_SAMPLER_KEY, register
 from mi_neural.integrators.lighting import LightSamplingIntegrator
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.media import Media
 from mi_neural.render.spectrum import is_rgb
 
 
@@ -74,8 +73,6 @@ class PlainPathIntegrator(LightSamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.media: Media | None = None
-        self.camera_medium, self.camera_medium_id = None, -1
         self.neural_depth = props.get("neural_depth", -1)
         self.records = self.neural_depth < 0
         self.unshadowed: UnshadowedLights | None = None
@@ -90,6 +87,8 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         known = self.bound.knows(scene)
         super().bind(scene, sensor, train)
         self.bind_media(scene, sensor, known)
+        if self.media is not None and self.neural_depth >= 0:
+            raise ValueError("plain_path: neural_depth works in scenes without participating media; leave it out")
         if self.neural_depth < 0 or self.lights is None:  # a single light is traced as ever
             self.unshadowed = None
             return
@@ -105,23 +104,6 @@ class PlainPathIntegrator(LightSamplingIntegrator):
                 self.unshadowed = UnshadowedLights(scene, lights.table)
             else:
                 self.unshadowed.refresh()
-
-    def bind_media(self, scene, sensor, known: bool) -> None:
-        """Look for media in a scene, and where the camera is in one."""
-        medium = sensor.get_medium() if hasattr(sensor, "get_medium") else None
-        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
-            self.film_state.forget_scene()
-            self.media = Media.of(scene, [sensor])
-            check_phase_functions(scene, sensor, self.plugin)
-        elif self.media is not None and self.media.edited():
-            self.film_state.forget_scene()
-        if self.media is None:
-            return
-        if self.neural_depth >= 0:
-            raise ValueError("plain_path: neural_depth works in scenes without participating media; leave it out")
-        if self.lights is not None:
-            check_lights_in_media(self.lights, self.plugin)
-        self.camera_medium, self.camera_medium_id = medium, -1 if medium is None else medium.ptr
 
     def check_gradients(self, scene) -> None:
         if self.media is not None:

@@ -26,6 +26,7 @@ from .lights.inexact import inexact
 from .lights.sampling import VISIBILITY_FLOOR, Columns, PowerLights
 from .lights.table import ENVIRONMENT, LOCAL, LightTable, importance
 from .render.frozen import undisturbed
+from .render.media import media_of
 from .render.sampling import PathSampler
 
 MODES = ("scene", "everything")
@@ -63,7 +64,7 @@ class SceneFacts:
     film          (width, height) in pixels; None without a sensor
     extent        longest side of the scene's box, in its unit; None where that is not finite
     sensors       their number
-    media         whether a shape borders a participating medium
+    media         whether there are participating media
     unknown_roughness   glossy shapes whose alpha cannot be read: measured materials, procedural textures, hair
     inexact       emitters that Mitsuba itself does not sample exactly, by what keeps it (:mod:`.lights.inexact`)
     """
@@ -111,7 +112,7 @@ class SceneFacts:
             emitters, triangles, lights, surfaces, textures, (min(alphas), max(alphas)) if alphas else None,
             None if not hasattr(sensor, "film") else tuple(int(n) for n in sensor.film().crop_size()),
             float(box.max()) if np.isfinite(box).all() else None,
-            len(scene.sensors()), any(s.is_medium_transition() for s in scene.shapes()), unknown, wrong,
+            len(scene.sensors()), bool(media_of(scene, [sensor])), unknown, wrong,
         )  # fmt: skip
 
     @property
@@ -346,9 +347,11 @@ def _cache(facts: SceneFacts, request: Request) -> Decision:
         return left_out(f"paths of at most {request.max_depth} segments meet no light that was reflected before")
     if not known:
         return given(False, "a path tracer")
-    if not facts.smooth and not request.everything:
+    if not (facts.smooth or facts.media or request.everything):
         return left_out(f"all of {n} surfaces are mirrors or glass")
     why = f"{facts.smooth} of {n} surfaces reflect from all around"
+    if facts.media:
+        why += ", and media scatter"
     return given(known, why) if "cache" in request.given else modelled(known, why)
 
 

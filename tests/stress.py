@@ -42,13 +42,15 @@ class Entrant:
 
     def refusal(self, case) -> str | None:
         """What the error of a hard case must contain; None: an image is expected."""
-        return None if case.media and self.keys["type"] in ("plain_path", "volpath") else case.refusal
+        return None if case.media and self.keys["type"] in RENDER_MEDIA else case.refusal
 
     def reference(self, case) -> str:
         """The name of what it is compared with."""
         return "volpath" if case.media else "path, direct" if self.depth == 2 else "path"
 
 
+#: Integrators that render participating media.
+RENDER_MEDIA = ("plain_path", "nrc", "neural_path", "volpath")
 #: Lights that the camera sees are noise of a known kind: left out by all, what they light is measured the better.
 PATH = {"hide_emitters": True}
 

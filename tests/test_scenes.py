@@ -10,7 +10,7 @@ import pytest
 
 from mi_neural import scenes
 
-NAMES = ["ajar_door", "cornell_box", "glossy_hall", "lamp_bays", "lit_cube", "point_lit_sphere"]
+NAMES = ["ajar_door", "cornell_box", "foggy_hall", "glossy_hall", "lamp_bays", "lit_cube", "point_lit_sphere"]
 OBJECTS = "bsdf emitter integrator sensor shape".split()
 
 
@@ -41,7 +41,8 @@ def test_objects_have_unique_ids_and_references_meet_them(name):
     assert all(e.get("id") for e in root.iter("emitter"))
 
     references = {e.get("id") for e in root.iter("ref")}
-    assert references == {e.get("id") for e in root.findall("bsdf")}  # none unknown, none unused
+    named = {e.get("id") for e in (*root.findall("bsdf"), *root.findall("medium"))}
+    assert references == named  # none unknown, none unused
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -57,7 +58,7 @@ def test_scene_needs_no_other_file_and_takes_the_common_parameters(name):
     assert re.search(r"max_depth = 5\b", str(scene.integrator()))
 
 
-@pytest.mark.parametrize("name", ["ajar_door", "cornell_box", "glossy_hall", "lamp_bays"])
+@pytest.mark.parametrize("name", ["ajar_door", "cornell_box", "foggy_hall", "glossy_hall", "lamp_bays"])
 def test_renders_finite_and_well_exposed(name):
     image = np.array(mi.render(mi.load_file(str(scenes.path(name)), resx=64, resy=36, spp=64)))
     assert np.isfinite(image).all() and (image >= 0).all()

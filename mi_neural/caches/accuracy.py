@@ -207,7 +207,7 @@ class MeasuredCache(OutgoingCache):
         field = cache.field
         with dr.suspend_grad():
             glossy = scene_is_glossy(scene)
-            traced = training_paths(scene, sensor, field, self.training, seed, lights, glossy, twins=True)
+            traced = training_paths(scene, sensor, field, self.training, seed, lights, glossy, True, self.walk)
             n_valid, n_bad = dr.count(traced.outgoing.valid), traced.n_bad[0]
             dr.eval(traced, n_valid)
             pairs = pairs_of(traced, field, self.training.n_paths)

@@ -117,7 +117,8 @@ def trace_records(
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
-    def from_cache(si, bsdf, active, sampler):
+    def from_cache(path, active, sampler):
+        si, bsdf = path.si, path.si.bsdf(path.ray)
         features = field.encode(si.p, vertex.facing(si), **material_of(field, si, bsdf, active))
         return reflect(field, features, si, bsdf, training.n_tail, sampler, active)
 

@@ -19,7 +19,8 @@ import numpy as np
 
 from ..render.kernels import on_gpu
 from ..render.sampling import PathSampler
-from ..render.surface import scene_is_glossy, surface_of
+from ..render.surface import scene_is_glossy
+from ..render.walk import SURFACES, SurfaceWalk
 from . import encoding, loss
 from .blend import OutgoingBlend
 from .field import FieldShape, TrainedField, Weights, shortcut
@@ -393,7 +394,7 @@ class OutgoingTraining(Training):
 
 def training_paths(
     scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool,
-    twins: bool = False,
+    twins: bool = False, walk: SurfaceWalk = SURFACES,
 ):  # fmt: skip
     """Fresh training paths, targets ending in the averaged cache (in nothing without a field); see
     :func:`~mi_neural.caches.training_paths.trace_training_paths`."""
@@ -401,14 +402,14 @@ def training_paths(
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
     plan = training.paths(field is None, twins)
     if field is None:
-        return trace_training_paths(scene, sensor, sampler, plan, None, lights, None, glossy)
+        return trace_training_paths(scene, sensor, sampler, plan, None, lights, None, glossy, walk)
 
-    def query(si, bsdf, active, sampler):
-        return field.query(*surface_of(si, bsdf, active, glossy).inputs()), sampler
+    def query(path, active, sampler):
+        return field.query(*walk.surface(path, active, glossy).inputs()), sampler
 
     # Close before the place, where hardly anything can lie between
     places = field.places.position, field.places.view, 1e-3 * dr.norm(1 / field.box_inv_extent)
-    return trace_training_paths(scene, sensor, sampler, plan, query, lights, places, glossy)
+    return trace_training_paths(scene, sensor, sampler, plan, query, lights, places, glossy, walk)
 
 
 def fitted(records, training: OutgoingTraining):
@@ -416,9 +417,12 @@ def fitted(records, training: OutgoingTraining):
     return packed(records, training.capacity) if training.capacity < dr.width(records.valid) else records
 
 
-def trace_outgoing(scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool):
+def trace_outgoing(
+    scene, sensor, field: OutgoingField | None, training: OutgoingTraining, seed, lights, glossy: bool,
+    walk: SurfaceWalk = SURFACES,
+):  # fmt: skip
     """Fresh training records, and how many were left out because their targets were not finite."""
-    traced = training_paths(scene, sensor, field, training, seed, lights, glossy)
+    traced = training_paths(scene, sensor, field, training, seed, lights, glossy, walk=walk)
     records, n_bad = traced.outgoing, traced.n_bad[0]
     if field is not None:
         dr.eval(records, n_bad)
@@ -440,6 +444,8 @@ class OutgoingCache(IncidentCache):
     """A field of outgoing radiance together with its training. In all but what it learns an `IncidentCache`."""
 
     FIELD, BLEND = OutgoingField, OutgoingBlend
+    #: How training paths go from vertex to vertex; whoever changes it clears the recordings.
+    walk: SurfaceWalk = SURFACES
 
     def __init__(
         self, training: OutgoingTraining | None = None, shape: OutgoingShape | None = None, seed: int = 0, *,
@@ -450,7 +456,7 @@ class OutgoingCache(IncidentCache):
         )
 
     def probe(self, scene, sensor, lights, seed):
-        records, _ = trace_outgoing(scene, sensor, None, self.training, seed, lights, False)
+        records, _ = trace_outgoing(scene, sensor, None, self.training, seed, lights, False, self.walk)
         target = records.target / reflectance(records.surface.albedo)
         return records.surface.position, loss.luminance(target), records.valid
 
@@ -458,7 +464,9 @@ class OutgoingCache(IncidentCache):
         blend = cache if isinstance(cache, OutgoingBlend) else None
         field = blend.field if blend else cache
         with dr.suspend_grad():
-            records, n_bad = trace_outgoing(scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene))
+            records, n_bad = trace_outgoing(
+                scene, sensor, field, self.training, seed, lights, scene_is_glossy(scene), self.walk
+            )
             n_valid = dr.count(records.valid)
             dr.eval(records, n_bad, n_valid)
             learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor, field)
@@ -498,7 +506,7 @@ class OutgoingCache(IncidentCache):
         box = scene.bbox()
         whole = np.array(box.min).ravel(), np.array(box.max).ravel()
         low, high = encoding.record_box(points.T[valid], *whole)
-        if self.training.world_share > 0:
+        if self.training.world_share > 0 and self.walk.anywhere:
             low, high = _reaching(low, high, *whole)
         target, scale = np.sort(target[valid]), 0.0
         if target.size:

@@ -11,19 +11,21 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..estimators.spread import PathSpread
 from ..render import path as paths
 from ..render import vertex
 from ..render.film import film_rays
 from ..render.kernels import end_kernel
 from ..render.sampling import PathSampler
 from ..render.surface import Roughened, surface_of
+from ..render.walk import SURFACES, SurfaceWalk, Unlimited, fork
 from .records import OutgoingRecords, TrainingRecords, empty_surfaces, leave_out_nonfinite
 
 #: Contents of a cache of outgoing radiance: all light that a surface reflects, or that without direct light.
 CONTENTS = ("reflected", "indirect")
 #: Mirrors that the end of a training path is followed through.
 MAX_CHAIN = 16
+#: Training paths end nowhere by their depth.
+UNLIMITED = Unlimited()
 #: Vertices after which a path without an end is given up, and bounces before roulette may end it.
 MAX_VERTICES, RR_DEPTH = 256, 5
 
@@ -100,14 +102,37 @@ def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple 
     return ray
 
 
+def _twin_numbers(sampler, plan: Suffixes) -> tuple:
+    """(how many rays twins start with, random numbers of these)."""
+    n_rays = (plan.n_paths + 1) // 2
+    lane, seed = dr.arange(mi.UInt32, n_rays), dr.gather(mi.UInt32, sampler.scramble, 0)
+    return n_rays, PathSampler.make(lane, seed + 0x85EBCA6B, index=lane, scramble=seed)
+
+
 def _twin_rays(sensor, sampler, plan: Suffixes, places):
     """As :func:`first_rays`; two paths start with each ray, so that two independent estimates of the same radiance
     exist."""
-    n_rays = (plan.n_paths + 1) // 2
-    lane, seed = dr.arange(mi.UInt32, n_rays), dr.gather(mi.UInt32, sampler.scramble, 0)
-    numbers = PathSampler.make(lane, seed + 0x85EBCA6B, index=lane, scramble=seed)
+    n_rays, numbers = _twin_numbers(sampler, plan)
     rays = first_rays(sensor, numbers, n_rays, plan.world_share, places)
     return dr.gather(mi.Ray3f, rays, dr.arange(mi.UInt32, plan.n_paths) // 2)
+
+
+def _first_vertices(scene, sensor, sampler, plan: Suffixes, places, walk: SurfaceWalk) -> tuple:
+    """(rays, paths at what they meet, sampler)."""
+    if walk.anywhere:
+        if plan.twins:
+            ray = _twin_rays(sensor, sampler, plan, places)
+        else:
+            ray = first_rays(sensor, sampler, plan.n_paths, plan.world_share, places)
+        return ray, paths.start(ray, scene.ray_intersect(ray), mi.Bool(True)), sampler
+    # Where a ray ends in a medium is random: twins share the point, too
+    if not plan.twins:
+        ray = first_rays(sensor, sampler, plan.n_paths, 0, None)
+        return ray, *walk.camera_vertex(UNLIMITED, scene, ray, sampler, mi.Bool(True))
+    n_rays, numbers = _twin_numbers(sampler, plan)
+    ray = first_rays(sensor, numbers, n_rays, 0, None)
+    path, _ = walk.camera_vertex(UNLIMITED, scene, ray, numbers, mi.Bool(True))
+    return fork(ray, plan.n_paths), fork(path, plan.n_paths), sampler
 
 
 @dataclass
@@ -139,7 +164,7 @@ class Vertices:
         return cls(empty_surfaces(size), *colours, direction, smooth, stops, pdf)
 
     def keep(self, i, si, found: paths.Bounce, terminal, surface) -> None:
-        """Write entries `i`; `surface` is None where only positions and normals are wanted."""
+        """Write entries `i`; `surface` is None where only positions and normals of surfaces are wanted."""
         dr.scatter(self.emitted, found.Le, i)
         dr.scatter(self.estimated, found.L_nee, i)
         dr.scatter(self.weight, found.weight, i)
@@ -151,7 +176,7 @@ class Vertices:
             dr.scatter(self.records.surface.normal, vertex.facing(si), i)
         dr.scatter(self.records.valid, terminal, i)
         dr.scatter(self.direction, found.ray.d, i)
-        dr.scatter(self.smooth, terminal & found.followed & ~found.delta, i)
+        dr.scatter(self.smooth, terminal & found.traced & ~found.delta, i)
 
 
 @dataclass
@@ -162,19 +187,20 @@ class _Tracer:
     lights: object
     plan: Suffixes
     glossy: bool
+    walk_on: SurfaceWalk
 
     def surface(self, path, active):
-        return surface_of(path.si, path.si.bsdf(path.ray), active, self.glossy)
+        return self.walk_on.surface(path, active, self.glossy)
 
     def bounce(self, path, n_rough, sampler, albedo=None):
         """One bounce, the surface roughened as the path has bounced `n_rough` times before: (Bounce, sampler)."""
         bsdf = path.si.bsdf(path.ray)
-        if self.plan.roughening > 0:
+        if self.plan.roughening > 0 and self.walk_on.anywhere:
             albedo = surface_of(path.si, bsdf, path.active, False).albedo if albedo is None else albedo
             share = 1 - dr.power(mi.Float(1 - self.plan.roughening), n_rough)
             opaque = vertex.has_smooth(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
             bsdf = Roughened(bsdf, path.active & opaque & (sampler.next_1d() < share), albedo)
-        return paths.bounce(self.scene, self.lights, path, sampler, bsdf=bsdf)
+        return self.walk_on.bounce(UNLIMITED, self.scene, self.lights, path, sampler, bsdf=bsdf)
 
     def walk(self, path, spread, sampler) -> tuple:
         """The vertices with records: (Vertices, how many of each path, path, n_rough, whether it goes on, sampler)."""
@@ -185,17 +211,17 @@ class _Tracer:
 
         def step(k, path, spread, ends, n_rough, open_, sampler):
             i = k * plan.n_paths + lane
-            terminal = vertex.is_terminal(path.si, path.active)
+            terminal = self.walk_on.terminal(path, path.active)
             surface = self.surface(path, path.active) if plan.surfaces else None
             found, sampler = self.bounce(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
             vertices.keep(i, path.si, found, terminal, surface)
             if plan.densities:
                 dr.scatter(vertices.pdf, found.bs.pdf, i)
-            path = paths.advance(path, found)
+            before, path = path, self.walk_on.advance(UNLIMITED, path, found)
             open_ = mi.Bool(path.active)
             if plan.surfaces:
-                terminal = vertex.is_terminal(path.si, open_)
-                spread = spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, terminal)
+                terminal = self.walk_on.terminal(path, open_)
+                spread = self.walk_on.spread(spread, before, found, path, terminal)
                 wide = terminal & spread.exceeds(plan.threshold)
                 dr.scatter(vertices.stops, wide, i)
                 if plan.suffix == "spread":
@@ -219,13 +245,14 @@ class _Tracer:
 
         def run_on(k, path, n_rough, queries, sampler):
             found, sampler = self.bounce(path, n_rough, sampler)
-            path, sampler = paths.roulette(paths.advance(path, found), sampler, RR_DEPTH)
-            terminal = vertex.is_terminal(path.si, path.active)
+            path = self.walk_on.advance(UNLIMITED, path, found)
+            path, sampler = paths.roulette(path, sampler, RR_DEPTH)
+            terminal = self.walk_on.terminal(path, path.active)
             queries |= terminal & ~unbounded
             path.active &= (unbounded & (k < MAX_VERTICES)) | (~unbounded & ~terminal & (k < MAX_CHAIN))
             return k + 1, path, n_rough + dr.select(found.delta, 0, 1), queries, sampler
 
-        terminal = vertex.is_terminal(path.si, open_)
+        terminal = self.walk_on.terminal(path, open_)
         path = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1), depth=mi.UInt32(1),
                        active=open_ & (unbounded | ~terminal))  # fmt: skip
         _, path, n_rough, queries, sampler = dr.while_loop(
@@ -238,7 +265,7 @@ class _Tracer:
             end += dr.select(queries, path.β * found.direct, 0)
         if query is not None:
             end_kernel(end, path, queries, sampler)
-            value, sampler = query(path.si, path.si.bsdf(path.ray), queries, sampler)
+            value, sampler = query(path, queries, sampler)
             end += dr.select(queries, path.β * value, 0)
         return end
 
@@ -262,7 +289,7 @@ def _back_to_front(plan: Suffixes, vertices: Vertices, n_vertices, end) -> mi.Co
 
 def trace_training_paths(
     scene, sensor, sampler, plan: Suffixes, query: Callable | None, lights=None, places: tuple | None = None,
-    glossy: bool = True,
+    glossy: bool = True, walk: SurfaceWalk = SURFACES,
 ) -> PathRecords:  # fmt: skip
     """Training paths; each terminal vertex (see ``vertex.is_terminal``), but the last, gives one record.
 
@@ -272,20 +299,15 @@ def trace_training_paths(
 
     N being next-event estimation, E the emission met by the BSDF ray (the two share the direct light by MIS) and f the
     BSDF sample's weight. It is the target of outgoing records for the content ``reflected``; for ``indirect`` that is
-    ``f_k S_{k+1}``. The target of an incident record at vertex k is S_{k+1}. At the end of a path ``query(si, bsdf,
+    ``f_k S_{k+1}``. The target of an incident record at vertex k is S_{k+1}. At the end of a path ``query(path,
     active, sampler)``, which returns (value, sampler), stands for what the cache holds of S (self-training; None:
-    nothing). Paths that left the scene, or that run on without an end, are not self-trained.
+    nothing). Paths that left the scene, or that run on without an end, are not self-trained. `walk`: how paths go from
+    vertex to vertex.
     """
-    if plan.twins:
-        ray = _twin_rays(sensor, sampler, plan, places)
-    else:
-        ray = first_rays(sensor, sampler, plan.n_paths, plan.world_share, places)
-    si = scene.ray_intersect(ray)
-    path = paths.start(ray, si, mi.Bool(True))
-    terminal = vertex.is_terminal(si, path.active)
-    spread = PathSpread.start(plan.n_paths).arrive(si, ray, mi.Float(1), mi.Bool(True), terminal)
+    ray, path, sampler = _first_vertices(scene, sensor, sampler, plan, places, walk)
+    spread = walk.start(ray, path, walk.terminal(path, path.active))
 
-    tracer = _Tracer(scene, lights, plan, glossy)
+    tracer = _Tracer(scene, lights, plan, glossy, walk)
     vertices, n_vertices, path, n_rough, open_, sampler = tracer.walk(path, spread, sampler)
     end_kernel(vertices, n_vertices, path, n_rough, open_, sampler)
     end = tracer.ends(path, n_rough, open_, query, sampler)

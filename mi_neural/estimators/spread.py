@@ -70,10 +70,14 @@ class PathSpread:
 
     def arrive(self, si, ray, pdf, delta, smooth) -> PathSpread:
         """After `ray`, sampled with `pdf` over solid angle or by a `delta` lobe, met `si`, which is `smooth` or not."""
-        cos_theta = dr.dot(si.n, ray.d)
-        grows = self.started & ~delta & si.is_valid()
-        root = self.root + dr.select(grows, segment_spread(dr.square(si.t), pdf, cos_theta), 0)
-        distance = self.distance + dr.select(self.started | ~si.is_valid(), 0, si.t)
+        return self.reach(si.t, dr.dot(si.n, ray.d), pdf, delta, si.is_valid(), smooth)
+
+    def reach(self, length, cos_theta, pdf, delta, arrives, smooth) -> PathSpread:
+        """As :meth:`arrive`, after a segment of that `length`; `arrives`: whether it ended somewhere. In a medium
+        `cos_theta` is 1: nothing there is seen at an angle."""
+        grows = self.started & ~delta & arrives
+        root = self.root + dr.select(grows, segment_spread(dr.square(length), pdf, cos_theta), 0)
+        distance = self.distance + dr.select(self.started | ~arrives, 0, length)
         a_0 = dr.select(self.started, self.a_0, camera_spread(dr.square(distance), cos_theta))
         return PathSpread(root, a_0, distance, self.started | smooth)
 

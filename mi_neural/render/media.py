@@ -110,6 +110,10 @@ class MediumBounce(paths.Bounce):
     goes_on: mi.Bool
     last: Scattering
 
+    @property
+    def traced(self):
+        return self.goes_on
+
 
 class Place:
     """In the place of :class:`.path.Surface`: a surface in a scene with media, or a point in a medium."""
@@ -208,10 +212,11 @@ class Media:
         )  # fmt: skip
         return self._arrive(path, limit), sampler
 
-    def bounce(self, integrator, scene, lights, path: MediumPath, sampler) -> tuple:
+    def bounce(self, integrator, scene, lights, path: MediumPath, sampler, numbers=None) -> tuple:
         """Sample a direction where `path` stands, by BSDF or phase function, follow it to the next vertex, and find
-        direct light. Returns (:class:`MediumBounce`, sampler)."""
-        numbers, sampler = paths.draw_numbers(sampler)
+        direct light. Returns (:class:`MediumBounce`, sampler). `numbers`: in place of the sampler's own."""
+        if numbers is None:
+            numbers, sampler = paths.draw_numbers(sampler)
         si, active, in_medium = path.si, path.active, path.active & path.scattered
         at_surface = active & ~path.scattered
         bsdf = si.bsdf(path.ray)
@@ -223,9 +228,10 @@ class Media:
         weight = dr.select(in_medium, vertex.finite(weight_medium, pdf_medium > 0), weight)
         d = dr.select(in_medium, wo, si.to_world(bs.wo))
 
+        delta &= ~in_medium
         it, receiver = interaction(path), vertex.receiver(si, bsdf)
         here = last = Scattering(
-            it.p, it.n, *receiver, in_medium, dr.select(in_medium, pdf_medium, bs.pdf), delta & ~in_medium
+            it.p, it.n, *receiver, in_medium, dr.select(in_medium, pdf_medium, bs.pdf), delta
         )
         null, deeper, hidden = mi.Bool(False), active, None
         followed = active & (dr.max(weight) > 0)

@@ -94,6 +94,11 @@ class Bounce:
         """Direct light at the vertex: E[direct] = ∫ f Le cos dω."""
         return self.L_nee + self.weight * self.Le
 
+    @property
+    def traced(self):
+        """Whether the ray was traced."""
+        return self.followed
+
 
 def depth_limit(max_depth: int) -> int:
     """Mitsuba's ``max_depth``, -1 being no limit, as a number to compare depths with."""

@@ -1,0 +1,134 @@
+"""How paths that may end in a cache go from vertex to vertex: by surfaces alone, or through participating media, too.
+
+:class:`SurfaceWalk` has the steps of :mod:`.path`, :class:`MediaWalk` those of :mod:`.media`. There a vertex may also
+be a point at which a medium scatters. A path may end at such a point. What a cache holds of it is the radiance that is
+scattered towards the path: ``∫ p L dω``, p being the phase function. The medium's albedo is in the throughput that led
+there. So the reflectance that is factored out of the cache is 1 there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..estimators.spread import PathSpread
+from . import path as paths
+from . import vertex
+from .media import Media
+from .surface import Surface, surface_of
+
+
+class SurfaceWalk:
+    """Steps of paths in a scene without media. `integrator` names what :func:`.path.camera_vertex` reads of one."""
+
+    #: Added to ``rr_depth``.
+    later = 0
+    #: Whether paths may start anywhere, and surfaces may be made rougher.
+    anywhere = True
+
+    def camera_vertex(self, integrator, scene, ray, sampler, active) -> tuple:
+        """(a path at what a camera ray meets, sampler)."""
+        return paths.camera_vertex(integrator, scene, ray, active), sampler
+
+    def bounce(self, integrator, scene, lights, path, sampler, numbers=None, bsdf=None) -> tuple:
+        """(what a bounce found, sampler)."""
+        return paths.bounce(scene, lights, path, sampler, numbers, bsdf=bsdf)
+
+    def advance(self, integrator, path, found):
+        """The path at the next vertex."""
+        return paths.advance(path, found, paths.depth_limit(integrator.max_depth))
+
+    def terminal(self, path, active):
+        """Whether a path may end in a cache where it stands."""
+        return vertex.is_terminal(path.si, active)
+
+    def place(self, path) -> tuple:
+        """Where a path stands: (position, normal on the side that it came from)."""
+        return path.si.p, vertex.facing(path.si)
+
+    def surface(self, path, active, glossy: bool) -> Surface:
+        """Where a path stands, as a cache of outgoing radiance sees it."""
+        return surface_of(path.si, path.si.bsdf(path.ray), active, glossy)
+
+    def start(self, ray, path, smooth) -> PathSpread:
+        """The spread of a path at what its camera `ray` met, which is `smooth` (:meth:`terminal`) or not."""
+        spread = PathSpread.start(dr.width(path.si.t))
+        return spread.arrive(path.si, path.ray, mi.Float(1), mi.Bool(True), smooth)
+
+    def spread(self, spread: PathSpread, before, found, path, smooth) -> PathSpread:
+        """The spread of a path that came from `before` to `path` by the bounce `found`."""
+        return spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, smooth)
+
+
+class MediaWalk(SurfaceWalk):
+    """Steps of paths through `media`; `camera` is the medium that the camera is in (None: none).
+
+    Roulette begins one bounce later than on surfaces, as in ``volpath``.
+    """
+
+    later = 1
+    anywhere = False
+
+    def __init__(self, media: Media, camera: mi.Medium | None = None):
+        self.media, self.camera = media, camera
+
+    def camera_vertex(self, integrator, scene, ray, sampler, active):
+        return self.media.camera_vertex(integrator, scene, ray, self.camera, sampler, active)
+
+    def bounce(self, integrator, scene, lights, path, sampler, numbers=None, bsdf=None):
+        return self.media.bounce(integrator, scene, lights, path, sampler, numbers)
+
+    def advance(self, integrator, path, found):
+        return self.media.advance(integrator, path, found)
+
+    def terminal(self, path, active):
+        return active & (path.scattered | vertex.is_terminal(path.si, active))
+
+    def place(self, path):
+        normal = dr.select(path.scattered, path.ray.d, vertex.facing(path.si))
+        return dr.select(path.scattered, path.p, path.si.p), normal
+
+    def surface(self, path, active, glossy):
+        """A point in a medium has the normal ``-view``, which no surface that is seen has, and reflectance 1."""
+        surface = surface_of(path.si, path.si.bsdf(path.ray), active & ~path.scattered, glossy)
+        position, normal = self.place(path)
+        rough = dr.select(path.scattered, 1, surface.roughness) if glossy else surface.roughness
+        return Surface(
+            position, dr.select(path.scattered, normal, surface.normal),
+            dr.select(path.scattered, -path.ray.d, surface.view), dr.select(path.scattered, 1, surface.albedo), rough,
+        )  # fmt: skip
+
+    def start(self, ray, path, smooth):
+        spread = PathSpread.start(dr.width(path.si.t))
+        return self._reach(spread, ray.o, path, mi.Float(1), mi.Bool(True), smooth)
+
+    def spread(self, spread, before, found, path, smooth):
+        return self._reach(spread, self.place(before)[0], path, found.last.pdf, found.delta, smooth)
+
+    def _reach(self, spread: PathSpread, origin, path, pdf, delta, smooth):
+        cosine = dr.select(path.scattered, 1, dr.dot(path.si.n, path.ray.d))
+        distance, arrives = dr.norm(self.place(path)[0] - origin), path.scattered | path.si.is_valid()
+        return spread.reach(distance, cosine, pdf, delta, arrives, smooth)
+
+
+#: For scenes without media.
+SURFACES = SurfaceWalk()
+
+
+@dataclass(frozen=True)
+class Unlimited:
+    """In the place of an integrator, for paths that end nowhere by themselves."""
+
+    max_depth: int = -1
+    hide: bool = False
+
+
+def fork(path, n: int):
+    """`n` paths (or rays), of which 2k and 2k + 1 are as number k of `path`."""
+    half = dr.arange(mi.UInt32, n) // 2
+    if not is_dataclass(path):
+        return dr.gather(type(path), path, half)
+    values = ((f.name, getattr(path, f.name)) for f in fields(path))
+    return replace(path, **{name: dr.gather(type(v), v, half) for name, v in values if v is not None})
