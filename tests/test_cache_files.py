@@ -63,8 +63,17 @@ def whole(cache) -> dict:
     return cache.field.arrays() | (grid.arrays() if grid is not None else {})
 
 
+@pytest.fixture
+def one_thread():
+    """Sums of records are then in the same order each time."""
+    n = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(n)
+
+
 @pytest.mark.parametrize("kind", CACHES)
-def test_training_goes_on_from_a_file_as_if_never_interrupted(kind, cube, tmp_path):
+def test_training_goes_on_from_a_file_as_if_never_interrupted(kind, cube, tmp_path, one_thread):
     cache = CACHES[kind]()
     cache.train(*cube, frames=8)
     cache.rate_factor = 0.5
@@ -92,17 +101,18 @@ def test_without_the_moments_training_would_go_on_otherwise(cube, tmp_path):
         assert_alike(whole(cache), whole(new))
 
 
-def test_integrators_that_only_prepared_train_as_those_that_did_not(cube):
+def test_integrators_that_only_prepared_train_as_those_that_did_not(cube, one_thread):
     scene, _ = cube
-    images = []
+    fields = []
     for prepares in (False, True):
         nirc = mi.load_dict({"type": "nirc", "train_samples": 256, "levels": 4, "hashmap_size": 1024})
         nirc.train(scene, 8)
         if prepares:
             nirc.prepare(scene, spp=2)
         nirc.train(scene, 3)
-        images.append(nirc.cache.field.arrays())
-    assert_alike(*images)
+        fields.append(nirc.cache.field.arrays())
+    for name, value in fields[0].items():  # bit for bit
+        assert np.array_equal(value, fields[1][name], equal_nan=True), name
 
 
 def test_statistics_of_another_reliability_are_left_out(cube, tmp_path):
