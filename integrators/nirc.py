@@ -55,11 +55,14 @@ class NIRCIntegrator(IncidentIntegrator):
         self.light_samples = props.get("light_samples", -1)
         self.termination = props.get("termination", "adaptive")
         self.spread_threshold = props.get("spread_threshold", 0.01)
+        self.gather_half = props.get("gather_half", 4.0)
+        self.denoised = props.get("denoised", False)
         self.path_threshold = self.spread_threshold if "spread_threshold" in props else WIDE
         self.one_path = self.termination == "balanced"  # whether a camera sample is a path that stops in the cache
         self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
         self._check(self.light_samples == -1 or self.light_samples >= 1,
                     f"light_samples is {self.light_samples}; give -1 (chosen by noise) or at least 1")  # fmt: skip
+        self._check(self.gather_half >= 0, f"gather_half is {self.gather_half}; it must be 0 or more")
         self._check(self.termination in TERMINATIONS,
                     f"termination is '{self.termination}'; give one of: {', '.join(TERMINATIONS)}")  # fmt: skip
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
@@ -157,32 +160,38 @@ class NIRCIntegrator(IncidentIntegrator):
             self.state.plan.decisions["light_samples"] = chosen
 
     def settings(self, spp: int) -> tuple:
-        """Constant c of the spread test: that of paths that stop grows with the samples, so that E tends to that of
-        path tracing. Says as well how ``adaptive`` samples such an image."""
+        """The share of far light that is gathered: with ``adaptive`` 0 for a single sample a pixel, 1/2 after
+        `gather_half` more. Of paths that stop the constant c of the spread test, which grows with the samples, so that
+        E tends to that of path tracing. Says as well how ``adaptive`` samples such an image."""
         if self.termination == "adaptive":
-            self.one_path = spp > 1
-        return (max(self.path_threshold, spp / FULL) if self.one_path else self.spread_threshold,)
+            self.one_path = self.denoised and spp > 1
+        if self.one_path:
+            return (max(self.path_threshold, spp / FULL),)
+        if self.termination != "adaptive":
+            return ({"spread": 1.0}.get(self.termination, 0.0),)
+        more = max(spp - 1, 0)
+        return (more / (more + self.gather_half) if more else 0.0,)
 
     # -------------------------------------------------------------------------------------------------------------
 
     def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`, or
         that of a path that stops in the cache."""
-        (threshold,) = settings
+        (setting,) = settings
         path = paths.camera_vertex(self, scene, ray, active)
         path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
         si, active, n_light = path.si, path.active, self.n_light
         bsdf = si.bsdf(path.ray)
         if self.one_path and self.cached(field):
             by_chance = self.termination == "balanced"
-            rule = stopping.ByChance(self.cache_samples) if by_chance else stopping.WhereWide(threshold)
+            rule = stopping.ByChance(self.cache_samples) if by_chance else stopping.WhereWide(setting)
             return stopping.estimate(self, scene, lights, field, path, sampler, rule)
         features = None
         if self.cached(field):
             features = field.encode(si.p, vertex.facing(si), **material_of(field, si, bsdf, active))
 
         # ---------------- Samples with a ray: direct light, and what the ray meets ----------------
-        traced, cache, sampler = self.traced_samples(scene, lights, field, features, path, bsdf, threshold, sampler)
+        traced, cache, sampler = self.traced_samples(scene, lights, field, features, path, bsdf, setting, sampler)
 
         # -------------------------- Samples of the cache without a ray ----------------------------
         if features is not None:
@@ -201,11 +210,13 @@ class NIRCIntegrator(IncidentIntegrator):
         """Whether the cache is queried at all."""
         return self.needs_cache and field is not None
 
-    def traced_samples(self, scene, lights, field, features, path, bsdf, threshold, sampler):
+    def traced_samples(self, scene, lights, field, features, path, bsdf, mixture, sampler):
         """Sums over `n_light` BSDF samples that are traced: (:class:`Traced`, the cache's predictions, sampler)."""
         si, active, n_light = path.si, path.active, self.n_light
         here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
         a_0 = spread.camera_spread(dr.square(path.length), dr.dot(si.n, path.ray.d))
+        # Of these samples, so many gather what lies far: as few as the share allows, to save the others their rays
+        n_gather = dr.clip(dr.ceil(mixture * n_light), 1, n_light)
 
         def sample(i, traced, cache, sampler):
             numbers = paths.stratified(sampler, n_light, i)
@@ -218,15 +229,14 @@ class NIRCIntegrator(IncidentIntegrator):
             # ------------------ Reflection by what the ray met --------------------
             cos_theta = dr.dot(found.si.n, found.ray.d)
             width = dr.select(found.delta, 0, spread.segment_spread(found.si.t**2, found.bs.pdf, cos_theta))
+            far = dr.select(mi.Float(i) < n_gather, mixture * n_light / n_gather, 0)
             share = mi.Float(1)
             if features is not None:
-                share = self.gather_share(found.delta, found.bs.pdf, width, a_0, threshold)
+                share = self.gather_share(found.delta, found.bs.pdf, width, a_0, far)
             beyond = replace(paths.advance(here, found, self.depth_limit), L=mi.Color3f(0))
             beyond.active &= share > 0
             follows = mi.Bool(beyond.active)
-            beyond, n_rays, sampler = self.gather(
-                scene, lights, field, sampler, beyond, width, a_0, threshold, path.β
-            )
+            beyond, n_rays, sampler = self.gather(scene, lights, field, sampler, beyond, width, a_0, path.β)
             return i + 1, Traced(
                 traced.direct + found.direct,
                 traced.residual + dr.select(found.followed, share * (beyond.L - Li_cache), 0),
@@ -259,22 +269,22 @@ class NIRCIntegrator(IncidentIntegrator):
         )
         return cache, sampler
 
-    def gather_share(self, delta, pdf, width, a_0, threshold):
+    def gather_share(self, delta, pdf, width, a_0, far):
         """How much of a direction's light is gathered at what it meets, instead of read from the cache here.
 
         1 for delta and sharp lobes; 1 where the next surface is so near that the cache would blur what the pixel sees
-        (spread `width` below its `threshold`), unless `termination` is ``primary``; elsewhere 0, with ``spread`` 1, and
-        with ``balanced_shares`` its own.
+        (spread `width` below its threshold), unless `termination` is ``primary``; elsewhere `far`, or by
+        ``balanced_shares`` its own.
         """
         needed = delta | (pdf > SHARP_PDF)
         if self.termination != "primary":
-            needed |= ~spread.exceeds(width, a_0, threshold)
-        share = mi.Float(1 if self.termination == "spread" else 0)
+            needed |= ~spread.exceeds(width, a_0, self.spread_threshold)
+        share = far
         if self.termination == "balanced_shares":
             share = spread.follow_probability(max(self.cache_samples, 1), pdf)
         return dr.select(needed, 1, share)
 
-    def gather(self, scene, lights, field, sampler, path, width, a_0, threshold, β_first):
+    def gather(self, scene, lights, field, sampler, path, width, a_0, β_first):
         """Light that ``path.si`` reflects back along ``path.ray``, times ``path.β``; in ``path.L`` of what is returned.
 
         Next-event estimation there, the rest from the cache at the first vertex where the path is wide enough, by path
@@ -287,7 +297,7 @@ class NIRCIntegrator(IncidentIntegrator):
             si = path.si
             wide = mi.Bool(False)
             if cached:
-                wide = vertex.is_terminal(si, path.active) & spread.exceeds(width, a_0, threshold)
+                wide = vertex.is_terminal(si, path.active) & spread.exceeds(width, a_0, self.spread_threshold)
 
             def stops(pdf):
                 return wide & (pdf <= SHARP_PDF)
@@ -344,7 +354,7 @@ NIRCIntegrator.__doc__ = (
     The last sum runs over the directions that were traced for direct light anyway. It replaces the cache's answer by
     what is gathered one vertex later (next-event estimation there, the rest from the cache there), with a share
     :math:`u` that is 1 for mirrors, sharp lobes and surfaces so near that the cache would blur what the pixel sees, and
-    elsewhere depends on ``termination``; images of several samples a pixel are sampled otherwise, see there.
+    elsewhere depends on ``termination``.
     :math:`E[L_o]` is the path-traced radiance if the cache is exact.
 
     What the cache holds: light reflected at least once, next-event estimation included. What it does not: emission.
@@ -357,9 +367,14 @@ NIRCIntegrator.__doc__ = (
          most bias), 1 with ``spread``, and 1 - t with ``balanced_shares``, where t = Nc p_f / (Nc p_f + p_g) and
          :math:`p_f = 1/\pi`. Or by a path that stops at a vertex and asks the cache there for the light from the
          direction of its BSDF sample, without a ray: with ``balanced`` at each vertex with the probability t
-         (Dereviannykh et al.). ``adaptive``: one sample a pixel as ``primary`` but for near surfaces; more by a path
-         that stops at the first vertex where its spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4). Such a sample
-         costs a fifth to a half. Where paths stop, ``light_samples`` says nothing. (Default: adaptive)
+         (Dereviannykh et al.). ``adaptive``: by the sums, u being 0 for one sample a pixel and growing with the image's
+         sample count, as noise gives way to bias; with ``denoised`` several samples are paths that stop at the first
+         vertex where their spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4). Where paths stop, ``light_samples``
+         says nothing. (Default: adaptive)
+     * - denoised
+       - |bool|
+       - The image will be denoised, which removes noise, but not what stands out of it. See ``termination``.
+         ``mi-neural`` sets it with ``--denoise``. (Default: false)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is queried per camera sample. 0: no cache, ``nirc`` is a path tracer.
@@ -377,7 +392,10 @@ NIRCIntegrator.__doc__ = (
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0; 0: no surface is too near. Of paths that stop it is raised to N/256
-         where that is more, N being the samples a pixel. (Default: 0.01; of paths that stop 1)"""
+         where that is more, N being the samples a pixel. (Default: 0.01; of paths that stop 1)
+     * - gather_half
+       - |float|
+       - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)"""
     + INCIDENT_KEYS
     + SHARED_KEYS
     + INCIDENT_PRESETS

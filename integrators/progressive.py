@@ -114,8 +114,7 @@ class Mixed:
 
     def __init__(self, integrator, props):
         self.integrator = integrator
-        given = {k: props[k] for k in SHARED if k in props}
-        self.nirc = mi.load_dict({"type": "nirc", "termination": "spread", **given})
+        self.nirc = mi.load_dict({"type": "nirc", **{k: props[k] for k in SHARED if k in props}})
         self.nirc.channels = list(BIASED)
         self.nirc.cache = integrator.cache
         self.planned = False

@@ -77,12 +77,14 @@ def trained(sphere):
 
 
 @pytest.mark.parametrize("name, termination", [
-    *[("lit_cube", t) for t in TERMINATIONS], ("point_lit_sphere", "adaptive"),
+    *[("lit_cube", t) for t in (*TERMINATIONS, "denoised")],
+    *[("point_lit_sphere", t) for t in ("adaptive", "denoised")],
 ])  # fmt: skip
 def test_known_answer_within_two_percent_by_every_termination(name, termination):
     """Emission lost or counted twice at any vertex is off by an eighth or more."""
     scene, _ = load(name)
-    integrator = nirc(termination=termination, train_samples=1024)
+    keys = {"denoised": True} if termination == "denoised" else {"termination": termination}
+    integrator = nirc(**keys, train_samples=1024)
     image = render(scene, integrator, 64)
     print(f"{name}, {termination}: mean {image.mean():.4f} (known 1), after {integrator.cache.steps} training frames")
     assert integrator.cache.steps == 60
@@ -92,10 +94,11 @@ def test_known_answer_within_two_percent_by_every_termination(name, termination)
     assert np.median(np.abs(parts - 1)) < 0.02 and np.abs(parts - 1).max() < 0.3
 
 
-@pytest.mark.parametrize("termination", TERMINATIONS)
+@pytest.mark.parametrize("termination", [*TERMINATIONS, "denoised"])
 def test_right_cache_gives_the_right_image_by_every_termination(sphere, termination):
     """A cache that answers 1, which is exact in the sphere: no bias is left. Error rate 1e-4 per pixel and channel."""
-    integrator = nirc(termination=termination, freeze_cache=True)
+    keys = {"denoised": True} if termination == "denoised" else {"termination": termination}
+    integrator = nirc(**keys, freeze_cache=True)
     render(sphere, integrator, 1)
     field = integrator.cache.field
     field.restore({k: np.zeros_like(v) for k, v in field.snapshot().items()})
@@ -191,15 +194,24 @@ def test_hidden_emitters_are_looked_through_as_path_does(type_):
     assert_same_mean(ours, path, type_, relative=1e-5)
 
 
-def test_adaptive_takes_paths_that_stop_later_the_more_samples_there_are():
-    integrator, found = nirc(termination="adaptive"), []
+def test_share_of_gathered_light_follows_termination_and_samples():
+    assert [nirc(termination=t).settings(16)[0] for t in ("primary", "spread", "balanced_shares")] == [0, 1, 0]
+    shares = [nirc(termination="adaptive", gather_half=8.0).settings(n)[0] for n in (1, 2, 9, 1000, 10**6)]
+    assert shares == sorted(shares) and 0 <= shares[0] < 0.2 and shares[-1] > 0.99
+    for n in (1, 2, 16):
+        assert 0 <= nirc(gather_half=0.0).settings(n)[0] <= 1
+
+
+def test_denoised_images_take_paths_that_stop_later_the_more_samples_there_are():
+    integrator, found = nirc(denoised=True), []
     for n in (1, 2, 9, 1000, 10**6):
         found.append((*integrator.settings(n), integrator.one_path))
-    assert found[0] == (0.01, False) and all(one_path for _, one_path in found[1:])
+    assert found[0] == (0, False) and all(one_path for _, one_path in found[1:])
     thresholds = [c for c, _ in found[1:]]
     assert thresholds[:2] == [1, 1] and thresholds == sorted(thresholds) and thresholds[-1] > 1000
-    assert nirc(spread_threshold=0.5).settings(1) == (0.5,) and nirc(spread_threshold=4.0).settings(2) == (4.0,)
-    assert not any(nirc(termination=t).one_path for t in ("primary", "spread", "balanced_shares"))
+    assert nirc(denoised=True, spread_threshold=4.0).settings(2) == (4.0,)
+    keys = [{"termination": t, "denoised": True} for t in ("primary", "spread", "balanced_shares")]
+    assert not any(i.settings(16) and i.one_path for i in (nirc(**k) for k in [*keys, {}]))
 
 
 def test_balanced_paths_find_direct_light_as_path_does():
@@ -319,10 +331,13 @@ def test_emission_that_turns_into_nan_is_counted_and_stays_out_of_the_image():
 # ---------------------------------------------------------------- channels
 
 
-@pytest.mark.parametrize("spp, by_cache", [(1, 0.5), (16, 0.25)])
-def test_channels_sum_to_the_image(sphere, trained, spp, by_cache):
-    """Paths of several samples a pixel stop at the second vertex, where half of the light has gone."""
-    image = render(sphere, trained, spp)
+@pytest.mark.parametrize("denoised, by_cache", [(False, 0.5), (True, 0.25)])
+def test_channels_sum_to_the_image(sphere, trained, denoised, by_cache):
+    """Paths of a denoised image stop at the second vertex, where half of the light has gone."""
+    if denoised:
+        trained, given = nirc(channels="direct, cache, residual", denoised=True), trained
+        trained.cache = given.cache
+    image = render(sphere, trained)
     assert image.shape == (16, 16, 12) and trained.aov_names() == [
         f"{n}.{c}" for n in ("direct", "cache", "residual") for c in "RGB"
     ]
@@ -596,7 +611,7 @@ def test_each_sensor_of_a_scene_shows_its_own_view(mixed):
 @pytest.mark.parametrize("key, value", [
     ("max_depth", -2), ("rr_depth", 0), ("train_frames", -2), ("train_steps", -1), ("seed", -1), ("learning_rate", 0.0),
     ("learning_rate", -1.0), ("ema_decay", 1.5), ("ema_decay", -0.5), ("cache_samples", -1), ("light_samples", 0),
-    ("spread_threshold", -1.0), ("train_samples", 0), ("train_vertices", 1), ("levels", 0),
+    ("spread_threshold", -1.0), ("gather_half", -1.0), ("train_samples", 0), ("train_vertices", 1), ("levels", 0),
     ("hashmap_size", 33), ("width", 0), ("hidden_layers", 0), ("termination", "never"), ("channels", "direct,depht"),
 ])  # fmt: skip
 def test_impossible_key_is_refused_by_name(key, value):

@@ -204,6 +204,7 @@ SETTINGS = (
     Setting("termination", ("adaptive", "primary", "spread", "balanced", "balanced_shares"), only=("nirc",)),
     Setting("cache_samples", (1, 2, 4, 8, 16), only=("nirc",)),
     Setting("light_samples", (-1, 1, 2, 4, 8), only=("nirc",)),
+    Setting("gather_half", (0.0, 1.0, 4.0, 16.0, 64.0)),
     Setting("spread_threshold", (0.0, 1e-3, 1e-2, 0.1, 1.0)),
     Setting("max_depth", (-1, 1, 2, 3, 4, 8, 16)),
     Setting("initial_candidates", (1, 2, 4, 8, 16, 32)),
