@@ -354,8 +354,7 @@ NIRCIntegrator.__doc__ = (
     The last sum runs over the directions that were traced for direct light anyway. It replaces the cache's answer by
     what is gathered one vertex later (next-event estimation there, the rest from the cache there), with a share
     :math:`u` that is 1 for mirrors, sharp lobes and surfaces so near that the cache would blur what the pixel sees, and
-    elsewhere depends on ``termination``.
-    :math:`E[L_o]` is the path-traced radiance if the cache is exact.
+    elsewhere depends on ``termination``. :math:`E[L_o]` is the path-traced radiance if the cache is exact.
 
     What the cache holds: light reflected at least once, next-event estimation included. What it does not: emission.
 
@@ -373,8 +372,8 @@ NIRCIntegrator.__doc__ = (
          says nothing. (Default: adaptive)
      * - denoised
        - |bool|
-       - The image will be denoised, which removes noise, but not what stands out of it. See ``termination``.
-         ``mi-neural`` sets it with ``--denoise``. (Default: false)
+       - The image will be denoised: that removes noise, but no bias. See ``termination``. ``mi-neural`` sets it with
+         ``--denoise``. (Default: false)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is queried per camera sample. 0: no cache, ``nirc`` is a path tracer.
