@@ -58,7 +58,6 @@ class NIRCIntegrator(IncidentIntegrator):
         self.gather_half = props.get("gather_half", 4.0)
         self.denoised = props.get("denoised", False)
         self.path_threshold = self.spread_threshold if "spread_threshold" in props else WIDE
-        self.one_path = self.termination == "balanced"  # whether a camera sample is a path that stops in the cache
         self._check(self.cache_samples >= 0, f"cache_samples is {self.cache_samples}; give 0 (no cache) or more")
         self._check(self.light_samples == -1 or self.light_samples >= 1,
                     f"light_samples is {self.light_samples}; give -1 (chosen by noise) or at least 1")  # fmt: skip
@@ -117,6 +116,11 @@ class NIRCIntegrator(IncidentIntegrator):
         return super().needs_cache and self.cache_samples > 0
 
     @property
+    def one_path(self) -> bool:
+        """Whether a camera sample is a path that stops in the cache."""
+        return self.termination == "balanced" or (self.termination == "adaptive" and self.denoised)
+
+    @property
     def queries_per_sample(self) -> float:
         if not self.needs_cache:
             return 0.0
@@ -129,8 +133,8 @@ class NIRCIntegrator(IncidentIntegrator):
 
     def measure_scene(self, scene, sensor) -> None:
         """Choose `light_samples` by the noise of direct light at the first vertex, measured once per scene; a path that
-        stops by chance has one."""
-        if self.light_samples > 0 or self.termination == "balanced":
+        stops has one at each vertex."""
+        if self.light_samples > 0 or self.one_path:
             return
         n, lights = 2**14, self.state.lights
         lane = dr.arange(mi.UInt32, n)
@@ -162,9 +166,7 @@ class NIRCIntegrator(IncidentIntegrator):
     def settings(self, spp: int) -> tuple:
         """The share of far light that is gathered: with ``adaptive`` 0 for a single sample a pixel, 1/2 after
         `gather_half` more. Of paths that stop the constant c of the spread test, which grows with the samples, so that
-        E tends to that of path tracing. Says as well how ``adaptive`` samples such an image."""
-        if self.termination == "adaptive":
-            self.one_path = self.denoised and spp > 1
+        E tends to that of path tracing."""
         if self.one_path:
             return (max(self.path_threshold, spp / FULL),)
         if self.termination != "adaptive":
@@ -367,9 +369,9 @@ NIRCIntegrator.__doc__ = (
          :math:`p_f = 1/\pi`. Or by a path that stops at a vertex and asks the cache there for the light from the
          direction of its BSDF sample, without a ray: with ``balanced`` at each vertex with the probability t
          (Dereviannykh et al.). ``adaptive``: by the sums, u being 0 for one sample a pixel and growing with the image's
-         sample count, as noise gives way to bias; with ``denoised`` several samples are paths that stop at the first
-         vertex where their spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4). Where paths stop, ``light_samples``
-         says nothing. (Default: adaptive)
+         sample count, as noise gives way to bias; with ``denoised`` by a path that stops at the first vertex where its
+         spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4). Where paths stop, ``light_samples`` says nothing.
+         (Default: adaptive)
      * - denoised
        - |bool|
        - The image will be denoised: that removes noise, but no bias. See ``termination``. ``mi-neural`` sets it with

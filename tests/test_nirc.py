@@ -203,15 +203,29 @@ def test_share_of_gathered_light_follows_termination_and_samples():
 
 
 def test_denoised_images_take_paths_that_stop_later_the_more_samples_there_are():
-    integrator, found = nirc(denoised=True), []
-    for n in (1, 2, 9, 1000, 10**6):
-        found.append((*integrator.settings(n), integrator.one_path))
-    assert found[0] == (0, False) and all(one_path for _, one_path in found[1:])
-    thresholds = [c for c, _ in found[1:]]
-    assert thresholds[:2] == [1, 1] and thresholds == sorted(thresholds) and thresholds[-1] > 1000
+    integrator = nirc(denoised=True)
+    thresholds = [integrator.settings(n)[0] for n in (1, 2, 9, 1000, 10**6)]
+    assert integrator.one_path and thresholds[:3] == [1, 1, 1]
+    assert thresholds == sorted(thresholds) and thresholds[-1] > 1000
     assert nirc(denoised=True, spread_threshold=4.0).settings(2) == (4.0,)
     keys = [{"termination": t, "denoised": True} for t in ("primary", "spread", "balanced_shares")]
-    assert not any(i.settings(16) and i.one_path for i in (nirc(**k) for k in [*keys, {}]))
+    assert not any(nirc(**k).one_path for k in [*keys, {}])
+
+
+@pytest.mark.parametrize("keys", [{}, {"denoised": True}], ids=str)
+def test_prepared_passes_need_no_kernel_in_an_image_of_many_samples(keys):
+    """As a budget renders: passes of one sample of an image that is planned to have more."""
+    scene = load("point_lit_sphere", 16)[0]
+    integrator = nirc(**keys, train_frames=1, train_steps=0)
+    integrator.prepare(scene, spp=1)
+    integrator.train(scene, 1)
+    integrator.plan_samples(16)
+    dr.sync_thread()
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        render(scene, integrator, 1)
+    tracing = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and k["operation_count"] > 500]
+    assert tracing and all(k["cache_hit"] and not k["cache_disk"] for k in tracing)
 
 
 def test_balanced_paths_find_direct_light_as_path_does():
