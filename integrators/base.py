@@ -135,7 +135,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         # A user's recording, too, ends with the process where memory is freed in it
         with LOCK, dr.suspend_grad(), undisturbed() if is_recording() else nullcontext():
             self.bind(scene, sensor)
-            block = self._render(scene, sensor, as_seed(seed), spp)
+            block = self._render(scene, sensor, seed, spp)
             film = sensor.film()
             film.prepare(self.aov_names())
             film.put_block(block)
@@ -166,12 +166,21 @@ class FilmIntegrator(mi.SamplingIntegrator):
     def rendered(self, spp: int) -> None:
         """Called after each image."""
 
+    def place_samples(self, seed: int | None, first: int = 0) -> None:
+        """Say that the next images are parts of one: their samples are those with the numbers from `first` on, and
+        their stratified random numbers are those of `seed`, the same in all parts. None: each image is one by itself.
+
+        The mean of the parts then has less noise than that of independent images. The seeds of the parts must differ.
+        """
+        self.film_state.placed = None if seed is None else (seed, first)
+
     def _render(self, scene, sensor, seed, spp: int):
         """An image block with `spp` samples a pixel, in passes that fit memory."""
         film, area = sensor.film(), Area.of(sensor)
         film.prepare(self.aov_names())
         block = film.create_block()
         block.set_coalesce(False)
+        sequence, first = self.film_state.placed or (seed, 0)
         done = 0
         # A row of pixels at a time if one sample of all is too much, else several samples at a time
         while done < spp:
@@ -180,19 +189,22 @@ class FilmIntegrator(mi.SamplingIntegrator):
             rows = area.height if whole else max(1, self.PASS_SAMPLES // (n * area.width))
             for y in range(0, area.height, rows):
                 sizes = min(rows, area.height - y), n
-                block.put(*self.render_rows(scene, sensor, seed, sizes, first_row=y, first_sample=done, total=spp))
+                part = {"first_row": y, "first_sample": first + done, "sequence": sequence}
+                block.put(*self.render_rows(scene, sensor, seed, sizes, **part, total=spp))
             done += n
         return block
 
     def render_rows(self, scene, sensor, seed, sizes: tuple[int, int], first_row: int = 0, first_sample: int = 0,
-                    total: int | None = None, settings: tuple | None = None, sums: bool = False) -> tuple:  # fmt: skip
+                    total: int | None = None, settings: tuple | None = None, sums: bool = False,
+                    sequence=None) -> tuple:  # fmt: skip
         """Render ``sizes = (rows, samples a pixel)``, with no training: (places, values) as a film's block takes them.
 
         `total`: samples a pixel of the whole image. `settings`: in place of the integrator's own. `sums`: add the
-        samples of each pixel up, whatever the film's filter.
+        samples of each pixel up, whatever the film's filter. `sequence`: seed of the stratified numbers, if another.
         """
         numbers = (first_sample, sizes[1], first_row, sizes[0])
-        samples = Samples(as_seed(seed), *(dr.opaque(mi.UInt32, v) for v in numbers))
+        sequence = seed if sequence is None else sequence
+        samples = Samples(as_seed(seed), as_seed(sequence), *(dr.opaque(mi.UInt32, v) for v in numbers))
         if settings is None:
             settings = self.settings(self.planned_spp or total or sizes[1])
         keys = tuple((k, v) for k, v in vars(self).items() if isinstance(v, (bool, int, float, str)))
@@ -237,6 +249,7 @@ class _FilmState:
     def __init__(self):
         self.passes = Passes()
         self.planned_spp: int | None = None
+        self.placed: tuple[int, int] | None = None  # see place_samples()
         self.nonfinite: list = []
         self.n_bound = self.n_forgotten = 0
         self.entered = False  # whether Mitsuba's own render() is under way, which calls sample()

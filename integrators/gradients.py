@@ -168,7 +168,7 @@ def _passes(area: Area, spp: int):
 def _samples(area: Area, seed, first: int, n: int) -> tuple:
     """(:class:`Samples` of a pass, its number of lanes)."""
     numbers = (dr.opaque(mi.UInt32, v) for v in (first, n, 0, area.height))
-    return Samples(seed, *numbers), -(-area.n_pixels // PACKET) * PACKET * n
+    return Samples(seed, seed, *numbers), -(-area.n_pixels // PACKET) * PACKET * n
 
 
 def _places(area: Area, samples: Samples, n_lanes: int) -> tuple:

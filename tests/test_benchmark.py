@@ -121,6 +121,27 @@ def test_mean_of_passes_is_the_mean_of_the_integrator(loaded, path, clock):
     assert passes.rgb.mean() == pytest.approx(whole.mean(), rel=0.1)
 
 
+def spread_of_images(loaded, integrator, film=None) -> float:
+    """Variance of a pixel over eight images of 32 samples in passes of 2, mean of the pixels."""
+    images = [
+        budget.render_passes(loaded.scene, integrator, [2] * 16, 32, seed=seed, film=film and film()).rgb
+        for seed in range(8)
+    ]
+    return np.var(images, axis=0, ddof=1).mean()
+
+
+def test_passes_of_an_image_go_on_with_the_stratified_numbers(loaded):
+    """With these seeds, 0.52 of the variance of independent passes, which images have whose spread is measured. The
+    integrator's next image is one by itself."""
+    register()
+    plain = mi.load_dict({"type": "plain_path", "max_depth": 2, "hide_emitters": True})
+    before = np.array(mi.render(loaded.scene, integrator=plain, spp=4, seed=5))
+    together, apart = spread_of_images(loaded, plain), spread_of_images(loaded, plain, moments.Moments)
+    print(f"variance of passes that go on over that of independent ones: {together / apart:.3f}")
+    assert together < 0.75 * apart
+    assert np.allclose(before, mi.render(loaded.scene, integrator=plain, spp=4, seed=5), rtol=1e-5)
+
+
 def test_budget_is_met(loaded, path, clock):
     """To half of a sample, by passes of several sizes."""
     rendered = budget.render_seconds(loaded.scene, path, 0.4)

@@ -10,6 +10,7 @@ import pytest
 from expectation import ERROR_RATE
 from scipy import stats
 
+from mi_neural.render.film import PACKET, Area, Samples
 from mi_neural.render.sampling import PathSampler, sobol_2d
 
 N = 2**16
@@ -160,3 +161,22 @@ def test_dimension_of_each_lane_may_be_its_own():
     for d in range(4):
         assert (found[d::4] == np.array(sampler.together_1d(d))[0]).all()
     assert np.unique(found).size == 4
+
+
+def test_passes_with_one_sequence_are_one_set_of_stratified_numbers():
+    """Four passes of 4 samples have the stratified points of one pass of 16; their independent numbers are others."""
+
+    def numbers(seed, first, n):
+        samples = Samples(*(mi.UInt32(v) for v in (seed, 5, first, n, 0, 2)))
+        pixel, sample, active = samples.lanes(area, 2 * PACKET * n)
+        sampler = samples.sampler(pixel, sample, 1)
+        order = np.lexsort((np.array(sample), np.array(pixel)))
+        assert np.array(active).all()
+        columns = [*sampler.stratified_2d(2), sampler.together_1d(3), sampler.next_1d()]
+        return np.array([np.array(c)[order].reshape(-1, n) for c in columns])
+
+    area = Area(PACKET, 2, (PACKET, 2), (0, 0), 0, True)
+    whole = numbers(9, 0, 16)
+    parts = np.concatenate([numbers(seed, 4 * k, 4) for k, seed in enumerate((9, 10, 11, 12))], axis=2)
+    assert np.array_equal(whole[:3], parts[:3])
+    assert not np.isin(parts[3, :, 4:], whole[3]).any()

@@ -3,7 +3,7 @@
 Dr.Jit works asynchronously: the clock is read after ``dr.sync_thread()`` only. Kernels are compiled before it starts
 (:func:`warm_up`), and that time is reported by itself. Every integrator is driven in the same way; methods that
 Mitsuba's own integrators lack are looked up by name: `train`, `train_seconds`, `train_first`, `train_fraction`,
-`prepare`, `plan_samples`, `statistics`, `reset`, `reseed`.
+`prepare`, `plan_samples`, `place_samples`, `statistics`, `reset`, `reseed`.
 
 Ctrl-C ends a rendering early and keeps what has been rendered; the result says so. During training it ends the
 training, and one pass is rendered with what has been learned.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -94,6 +95,18 @@ def render_pass(scene, integrator, spp: int, seed: int, sensor: int = 0) -> np.n
         result = np.array(image)
         camera.sampler().seed(0, 1)  # or the sampler's state keeps the loop of this pass alive
     return result
+
+
+@contextmanager
+def placed(integrator, sequence: int, first: int):
+    """Inside, an integrator that can (`place_samples`) takes its stratified random numbers from those of the seed
+    `sequence`, from sample number `first` on: so the passes of an image go on where the one before ended."""
+    place = getattr(integrator, "place_samples", lambda *_: None)
+    place(sequence, first)
+    try:
+        yield
+    finally:
+        place(None)
 
 
 def statistics(integrator) -> dict[str, float]:
@@ -353,7 +366,7 @@ class _Run:
         self.keep, self.kept = keep, clock()
         self.scene, self.integrator, self.seed, self.sensor = scene, integrator, seed, sensor
         self.film = Accumulator() if film is None else film
-        self.n_passes = first
+        self.first = self.n_passes = first
         self.seconds_train = self.seconds_render = 0.0
         self.interrupted = False
 
@@ -375,7 +388,10 @@ class _Run:
         start = clock()
         seed = pass_seed(self.seed, STREAM_IMAGE, self.n_passes)
         take = self.film.replace if getattr(self.integrator, "cumulative", False) else self.film.add
-        take(render_pass(self.scene, self.integrator, spp, seed, self.sensor), spp)
+        # Where the spread of the passes is measured, they must be independent
+        sequence = seed if self.film.independent else pass_seed(self.seed, STREAM_IMAGE, self.first)
+        with placed(self.integrator, sequence, 0 if self.film.independent else self.film.spp):
+            take(render_pass(self.scene, self.integrator, spp, seed, self.sensor), spp)
         self.n_passes += 1
         seconds = clock() - start
         trained = min(max(0.0, statistics(self.integrator).get("seconds_train", 0.0) - trained_before), seconds)

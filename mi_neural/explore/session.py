@@ -8,7 +8,7 @@ import time
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.bench.budget import STREAM_IMAGE, pass_seed, render_pass, reset, statistics
+from mi_neural.bench.budget import STREAM_IMAGE, pass_seed, placed, render_pass, reset, statistics
 from mi_neural.bench.load import split_channels
 from mi_neural.bench.reference import load_reference
 from mi_neural.explore import controls
@@ -70,7 +70,8 @@ class Session:
             # Not the many steps that a first image begins with
             it.train(self.scene, 1 if self.n_frames == 0 else getattr(it, "train_steps", 1), sensor=self.sensor)
         seed = pass_seed(self.seed, STREAM_IMAGE, self.n_frames)
-        image = render_pass(self.scene, it, self.spp, seed, self.sensor)
+        with placed(it, self.sequence, self.taken):
+            image = render_pass(self.scene, it, self.spp, seed, self.sensor)
         self.taken += self.spp
         self.shown += 1
         if cumulative:
@@ -130,6 +131,7 @@ class Session:
         """Begin the picture anew; what was learned stays."""
         self._film = Accumulator()
         self.taken = self.shown = 0
+        self.sequence = pass_seed(self.seed, STREAM_IMAGE, self.n_frames)  # of the picture's stratified numbers
         if hasattr(self.integrator, "plan_samples"):
             self.integrator.plan_samples(None)
 

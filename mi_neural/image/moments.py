@@ -10,7 +10,12 @@ from . import metrics
 
 
 class Accumulator:
-    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted."""
+    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted.
+
+    `independent`: whether the passes must be, because their spread is measured.
+    """
+
+    independent = False
 
     def __init__(self) -> None:
         self.total: np.ndarray | None = None
@@ -58,6 +63,8 @@ class Moments(Accumulator):
     n_passes  number of passes that count, shape (height, width, 1)
     squares   Σ n (pass - mean)², shape (height, width, channels)
     """
+
+    independent = True
 
     def __init__(self) -> None:
         super().__init__()
@@ -119,6 +126,7 @@ class Groups(Accumulator):
     gives the interval for the error of this image (Student).
     """
 
+    independent = True
     #: Most groups; twice as many are merged in pairs.
     MOST = 8
 

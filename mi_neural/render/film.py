@@ -143,9 +143,14 @@ def recordable(sensor, seed: int):
 
 @dataclass
 class Samples:
-    """Which camera samples a pass renders; numbers as variables, so that one kernel serves all sizes. A PyTree."""
+    """Which camera samples a pass renders; numbers as variables, so that one kernel serves all sizes. A PyTree.
+
+    `seed` is that of the independent random numbers, `sequence` that of the stratified ones: passes of one image that
+    have it in common go on where the one before ended, at `first_sample`.
+    """
 
     seed: mi.UInt32
+    sequence: mi.UInt32
     first_sample: mi.UInt32
     n_samples: mi.UInt32
     first_row: mi.UInt32
@@ -166,8 +171,8 @@ class Samples:
 
     def sampler(self, pixel, sample, salt: int) -> PathSampler:
         """Random numbers of these samples; another `salt` gives other independent ones, the same stratified ones."""
-        scramble, _ = mi.sample_tea_32(pixel, self.seed, 4)
-        group, _ = mi.sample_tea_32(pixel // PACKET, self.seed ^ 0x2545F491, 4)
+        scramble, _ = mi.sample_tea_32(pixel, self.sequence, 4)
+        group, _ = mi.sample_tea_32(pixel // PACKET, self.sequence ^ 0x2545F491, 4)
         lane = pixel + sample * mi.UInt32(0x9E3779B9)
         return PathSampler.make(lane, self.seed ^ salt, sample, scramble, group)
 
