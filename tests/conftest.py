@@ -16,6 +16,7 @@ import quick_kernels  # noqa: F401  (first: it chooses how kernels are compiled)
 
 import mi_neural  # isort: skip  (second: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -29,6 +30,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 if text := mi_neural.variant_problem(VARIANT):
     raise pytest.UsageError(f"MI_NEURAL_TEST_VARIANT: {text}")
+# A share of the cores for each process of pytest-xdist. A thread that waits for work spins for 20 ms: with more threads
+# than cores that is a quarter of all time
+dr.set_thread_count(max(1, dr.thread_count() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))))
 mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
 gc.disable()  # while test modules are imported: what they define stays
 
@@ -118,9 +122,12 @@ def shared_scenes() -> Path:
 
 @pytest.fixture
 def run_python(tmp_path):
-    """`run_python(code, VAR="...")`: code in a fresh interpreter, without our choice of LLVM; `ok=False`: may fail."""
+    """`run_python(code, VAR="...")`: code in a fresh interpreter, without our choice of LLVM; `ok=False`: may fail;
+    `quick=True`: `mi_neural` is imported first, and kernels are compiled as in this process."""
 
-    def run(code: str, ok: bool = True, **env: str) -> subprocess.CompletedProcess:
+    def run(code: str, ok: bool = True, quick: bool = False, **env: str) -> subprocess.CompletedProcess:
+        if quick:
+            code = f"import sys; sys.path.insert(0, {str(ROOT / 'tests')!r}); import quick_kernels\n{code}"
         base = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
         done = subprocess.run(
             [sys.executable, "-c", code], env=base | env, cwd=tmp_path, capture_output=True, text=True, timeout=300
