@@ -14,9 +14,8 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from path_lengths import scene_and_reference
-
 from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.bench import reference as references
 from mi_neural.bench.reference import Reference
 from mi_neural.image import exr, metrics
 
@@ -60,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     mi.set_variant(options.variant)
     try:
-        loaded, reference = scene_and_reference(options.scene, options.reference, terminal.parse_size(options.size))
+        loaded, reference = references.with_scene(options.scene, options.reference, terminal.parse_size(options.size))
         load.parse_integrator(options.integrator[0])
     except load.InputError as error:
         print(error, file=sys.stderr)
