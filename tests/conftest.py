@@ -30,9 +30,21 @@ ROOT = Path(__file__).resolve().parents[1]
 
 if text := mi_neural.variant_problem(VARIANT):
     raise pytest.UsageError(f"MI_NEURAL_TEST_VARIANT: {text}")
-# A share of the cores for each process of pytest-xdist. A thread that waits for work spins for 20 ms: with more threads
-# than cores that is a quarter of all time
-dr.set_thread_count(max(1, dr.thread_count() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))))
+
+
+def _threads_that_wait_let_others_work():
+    """A thread of Dr.Jit that waits for work spins for 20 ms. Where each core has a process of pytest-xdist, that was a
+    quarter of all time. With the lowest priority they spin, and work, where a core is idle."""
+    tasks, n = Path("/proc/self/task"), dr.thread_count()
+    if tasks.is_dir():
+        dr.set_thread_count(1)  # this one
+        before = {t.name for t in tasks.iterdir()}
+        dr.set_thread_count(n)
+        for tid in {t.name for t in tasks.iterdir()} - before:
+            os.setpriority(os.PRIO_PROCESS, int(tid), 19)
+
+
+_threads_that_wait_let_others_work()
 mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
 gc.disable()  # while test modules are imported: what they define stays
 
