@@ -3,6 +3,7 @@
 The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest` runs the same tests on a GPU.
 """
 
+import contextlib
 import gc
 import importlib
 import os
@@ -16,7 +17,6 @@ import quick_kernels  # noqa: F401  (first: it chooses how kernels are compiled)
 
 import mi_neural  # isort: skip  (second: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -27,24 +27,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 VARIANT = os.environ.get("MI_NEURAL_TEST_VARIANT", "llvm_ad_rgb")
 ROOT = Path(__file__).resolve().parents[1]
+TASKS = Path("/proc/self/task")  # the threads of this process
 
 if text := mi_neural.variant_problem(VARIANT):
     raise pytest.UsageError(f"MI_NEURAL_TEST_VARIANT: {text}")
-
-
-def _threads_that_wait_let_others_work():
-    """A thread of Dr.Jit that waits for work spins for 20 ms. Where each core has a process of pytest-xdist, that was a
-    quarter of all time. With the lowest priority they spin, and work, where a core is idle."""
-    tasks, n = Path("/proc/self/task"), dr.thread_count()
-    if tasks.is_dir():
-        dr.set_thread_count(1)  # this one
-        before = {t.name for t in tasks.iterdir()}
-        dr.set_thread_count(n)
-        for tid in {t.name for t in tasks.iterdir()} - before:
-            os.setpriority(os.PRIO_PROCESS, int(tid), 19)
-
-
-_threads_that_wait_let_others_work()
 mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
 gc.disable()  # while test modules are imported: what they define stays
 
@@ -66,8 +52,18 @@ def _what_earlier_modules_imported_stays():
     _keep_what_is_there()
 
 
+def _threads_that_wait_let_others_work():
+    """A thread of Dr.Jit that waits for work spins for 20 ms. Where each core has a process of pytest-xdist, that was a
+    quarter of all time. With the lowest priority they spin, and work, where a core is idle."""
+    for task in TASKS.iterdir() if TASKS.is_dir() else ():  # Linux
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            if (task / "comm").read_text().startswith("nt ["):
+                os.setpriority(os.PRIO_PROCESS, int(task.name), 19)
+
+
 @pytest.fixture(autouse=True)
 def _same_start_for_every_test():
+    _threads_that_wait_let_others_work()  # a test may have started new ones
     mi.set_variant(VARIANT)
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 (for libraries that draw from the global state)
