@@ -104,18 +104,6 @@ def factors(points: list[Point]) -> list[dict]:
     return out
 
 
-def scene_and_reference(name: str, file: str | None, size) -> tuple[load.LoadedScene, Reference]:
-    """The scene and the image that it is compared with. Raises ``InputError`` where there is none."""
-    if file is not None:
-        reference = references.load_reference(file, size)
-        return load.load_scene(name, size=size or reference.rgb.shape[1::-1]), reference
-    loaded = load.load_scene(name, size=size)
-    if (beside := references.beside(loaded.path, loaded.size)) is None:
-        width, height = loaded.size
-        raise load.InputError(f"no reference of {width}x{height} lies beside {loaded.path}: add --reference FILE.exr")
-    return loaded, references.load_reference(beside, loaded.size)
-
-
 def plot(points: list[Point], title: str):
     """Squared bias over rays a sample, a line per integrator; a matplotlib figure."""
     from matplotlib.figure import Figure
@@ -151,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     mi.set_variant(options.variant)
     try:
-        loaded, reference = scene_and_reference(options.scene, options.reference, terminal.parse_size(options.size))
+        loaded, reference = references.with_scene(options.scene, options.reference, terminal.parse_size(options.size))
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

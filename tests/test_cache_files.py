@@ -131,6 +131,20 @@ def test_statistics_of_another_reliability_are_left_out(cube, tmp_path):
     assert plain.queried is plain.field
 
 
+def small_nirc():
+    sizes = {"train_samples": 256, "levels": 4, "hashmap_size": 1024, "width": 16}
+    return mi.load_dict({"type": "nirc", "blend": "reliability", **sizes})
+
+
+@pytest.fixture(scope="module")
+def saved(cube, tmp_path_factory):
+    """The file of a cache after two training steps."""
+    nirc, path = small_nirc(), tmp_path_factory.mktemp("saved") / "a.npz"
+    nirc.train(cube[0], 2)
+    nirc.save_cache(path)
+    return path
+
+
 @pytest.mark.parametrize("change", [
     lambda h, a: h.pop("training"), lambda h, a: h["training"].update(rate_factor=0),
     lambda h, a: h["training"].update(history="long"), lambda h, a: h["training"].update(levels=[None]),
@@ -140,23 +154,18 @@ def test_statistics_of_another_reliability_are_left_out(cube, tmp_path):
     lambda h, a: h["shape"].update(hashmap_size=2**40), lambda h, a: h["shape"].update(width=10**6),
     lambda h, a: a.update(beside=np.zeros(1)),
 ])  # fmt: skip
-def test_damaged_state_is_refused_and_nothing_is_half_loaded(cube, tmp_path, change):
+def test_damaged_state_is_refused_and_nothing_is_half_loaded(cube, saved, tmp_path, change):
     scene, _ = cube
-    nirc = mi.load_dict({"type": "nirc", "blend": "reliability", "train_samples": 256, "levels": 4,
-                         "hashmap_size": 1024, "width": 16})  # fmt: skip
-    nirc.train(scene, 2)
-    nirc.save_cache(tmp_path / "a.npz")
-    header, arrays = files.read(tmp_path / "a.npz", "incident")
+    header, arrays = files.read(saved, "incident")
     change(header, arrays)
     files.write(tmp_path / "b.npz", "incident", header, arrays)
-    new = mi.load_dict({"type": "nirc", "blend": "reliability", "train_samples": 256, "levels": 4,
-                        "hashmap_size": 1024, "width": 16})  # fmt: skip
+    new = small_nirc()
     new.train(scene, 1)
     field = new.cache.field
     with pytest.raises(CacheFileError, match=r"b\.npz"):
         new.load_cache(tmp_path / "b.npz", scene)
     assert new.cache.steps == 1 and new.cache.field is field and len(new.cache.history) == 1
-    new.load_cache(tmp_path / "a.npz", scene)
+    new.load_cache(saved, scene)
     assert new.cache.steps == 2
 
 

@@ -172,7 +172,7 @@ def test_old_scenes_collected_while_a_pass_is_recorded_do_no_harm(run_python):
         assert gc.isenabled()
         print("done")
     """
-    assert run_python(code).stdout.splitlines()[-1] == "done"
+    assert run_python(code, quick=True).stdout.splitlines()[-1] == "done"
 
 
 GARBAGE = """
@@ -204,4 +204,4 @@ assert integrator.measure_query(2**10) > 0
 
 def test_garbage_is_not_collected_while_something_is_recorded(run_python, variant):
     """What wraps memory of NumPy, freed by a collection while Dr.Jit records, ends the process. In one of its own."""
-    run_python(GARBAGE.replace("VARIANT", repr(variant)))
+    run_python(GARBAGE.replace("VARIANT", repr(variant)), quick=True)

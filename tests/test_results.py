@@ -81,8 +81,8 @@ def test_extraction_of_every_table_fits_its_rows_and_columns(results):
     for table in found:
         assert len(table["extract"]["rows"]) == len(table["rows"])
         assert len(table["extract"]["columns"]) == len(table["columns"])
-        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "width", "values",
-                "as", "title", "each")  # fmt: skip
+        keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "asked", "width",
+                "values", "as", "title", "each")  # fmt: skip
         for part in (*table["extract"]["rows"], *table["extract"]["columns"]):
             assert not set(part or {}) - set(keys)
 
@@ -196,6 +196,19 @@ def test_path_lengths_of_the_study_are_read(results, tmp_path):
     nrc = [["0.00", "0.1"], ["1.00", "0.001"], ["0.50", "1.00"]]
     assert table["rows"][0][2:] == [["0.000", "0.01"], *nrc, ""]
     assert table["rows"][2][2:] == [["1.000", "0.01"], *nrc, ["0.5", "1"]]
+
+
+def test_errors_asked_for_and_found_are_read(results, tmp_path):
+    """As `studies/until_error.py` writes them, a folder a scene."""
+    study, table = load_study("until_error"), of(results, "until_error")
+    for scene in ("cornell-box", "staircase2", "veach-ajar"):
+        images = [study.asdict(study.Image(name, error, 0.0299, 0.04444, 10, 15)) for name in ("path", "neural_path")
+                  for error in (0.03, 0.01)]  # fmt: skip
+        (tmp_path / scene).mkdir()
+        text = json.dumps({"scene": scene, "size": [8, 8], "images": images, "environment": ENVIRONMENT})
+        (tmp_path / scene / "results.json").write_text(text, encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "*/results.json", "images"), "abc1234", None)
+    assert [row[2:] for row in table["rows"]] == [["0.0299", "0.0444", "10", "15"]] * 7
 
 
 def test_what_a_plan_saves_is_read(results, tmp_path):

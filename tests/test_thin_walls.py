@@ -51,19 +51,26 @@ def of_the_housing(scene) -> np.ndarray:
     return np.array(inside).reshape(SIZE, SIZE)
 
 
+@pytest.fixture(scope="module")
+def spot():
+    """The scene, which pixels show the housing, and what `path` shows there."""
+    scene = spotlight()
+    seen = of_the_housing(scene)
+    assert seen.sum() > 30
+    right = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 64}), spp=256))
+    return scene, seen, right[seen]
+
+
 @pytest.mark.parametrize("settings", [
     {"type": "nirc", "termination": "primary", "train_frames": 300},
     pytest.param({"type": "nirc", "termination": "primary", "blend": "fast", "train_frames": 150},
                  marks=pytest.mark.slow),
     {"type": "nrc", "spread_threshold": 0.0, "train_frames": 150},
 ], ids=["nirc", "blend", "nrc"])  # fmt: skip
-def test_light_inside_a_housing_of_no_thickness_stays_there(settings):
+def test_light_inside_a_housing_of_no_thickness_stays_there(settings, spot):
     """What the cache shows of the outside, against path tracing of 256 samples a pixel (its noise in the mean over the
     housing: below 5 %). Looked up on the surface itself, the ratio is 38 with `nirc` and 11 with `nrc`; two cells above
     it 1.6, 1.3 and 1.9."""
-    scene = spotlight()
-    seen = of_the_housing(scene)
-    assert seen.sum() > 30
-    right = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 64}), spp=256))[seen]
+    scene, seen, right = spot
     shown = np.array(mi.render(scene, integrator=mi.load_dict({"train_steps": 0, **settings}), spp=16))[seen]
     assert 0.5 < shown.mean() / right.mean() < 3

@@ -1,13 +1,16 @@
 """Rendering to an error: the estimate is right as often as it says, and rendering ends soon after it is reached."""
 
+import json
+
 import mitsuba as mi
 import numpy as np
 import pytest
+from load_study import load_study
 from typer.testing import CliRunner
 
 from mi_neural import cli, scenes
 from mi_neural.bench import budget
-from mi_neural.image import metrics
+from mi_neural.image import exr, metrics
 from mi_neural.image.moments import CONFIDENCE, Groups
 
 
@@ -95,3 +98,18 @@ def test_command_says_what_was_reached(tmp_path, monkeypatch):
     assert refused.exit_code == 2 and "leave out --spp" in refused.output
     refused = run("--until-error", "0.1", "-i", "nirc_two_level", "--set", "mode=progressive")
     assert refused.exit_code == 2 and "compares passes" in refused.output
+
+
+def test_study_says_what_was_asked_estimated_and_found(tmp_path, capsys):
+    """In the point-lit sphere, where the image is 1 and its noise is small."""
+    study = load_study("until_error")
+    exr.write(tmp_path / "reference.exr", np.ones((8, 8, 3), np.float32))
+    arguments = ["point_lit_sphere", "--reference", str(tmp_path / "reference.exr"), "-i", "path", "-i",
+                 "nrc:train_frames=8,train_samples=256", "--errors", "0.02", "-o", str(tmp_path)]  # fmt: skip
+    assert study.main(arguments) == 0
+    images = json.loads((tmp_path / "results.json").read_text())["images"]
+    assert [i["integrator"] for i in images] == [arguments[4], arguments[6]]
+    for image in images:
+        assert image["estimated"] <= image["asked"] == 0.02 and 0 < image["found"] < 0.1
+        assert image["hindsight"] == round(image["samples"] * image["found"] / 0.02)
+    assert study.main(["nowhere", *arguments[1:]]) == 2 and "no scene file" in capsys.readouterr().err

@@ -22,7 +22,7 @@ from mi_neural.image import exr
 from mi_neural.image.metrics import block_means, count_nonfinite, relative_squared_errors
 
 from .budget import STREAM_REFERENCE, Progress, clock, pass_seed, pixels, render_pass
-from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, split_channels
+from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, load_scene, split_channels
 
 #: Passes hold about this many samples and at most MAX_PASS_SPP a pixel: many passes, or there is no variance to
 #: estimate.
@@ -135,6 +135,21 @@ def beside(path: Path, size: tuple[int, int], scaled: bool = False) -> Path | No
         if numbers and (scale := scale_between(size, (w := int(numbers[1]), int(numbers[2])))):
             found.append((w < size[0], scale, other))
     return min(found)[-1] if found else None
+
+
+def with_scene(name: str, file: str | None, size: tuple[int, int] | None) -> tuple[LoadedScene, Reference]:
+    """A scene and the image that it is compared with: `file`, or the one beside the scene.
+
+    The scene has this `size`, else that of `file`, else its own. Raises :class:`InputError` where there is none.
+    """
+    if file is not None:
+        reference = load_reference(file, size)
+        return load_scene(name, size=size or reference.rgb.shape[1::-1]), reference
+    loaded = load_scene(name, size=size)
+    if (found := beside(loaded.path, loaded.size)) is None:
+        width, height = loaded.size
+        raise InputError(f"no reference of {width}x{height} lies beside {loaded.path}: add --reference FILE.exr")
+    return loaded, load_reference(found, loaded.size)
 
 
 def of_film(path: str | Path, loaded: LoadedScene) -> Reference:
