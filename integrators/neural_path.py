@@ -51,6 +51,9 @@ class NeuralPathIntegrator(OutgoingIntegrator):
     def default_unbounded(self, props) -> float:
         return DENOISED_UNBOUNDED if props.get("denoised", False) else super().default_unbounded(props)
 
+    def default_unbounded_in_media(self, props) -> float:
+        return 1.0 if props.get("denoised", False) else super().default_unbounded(props)
+
     @property
     def caches(self) -> tuple[str, ...]:
         return ("outgoing",)

@@ -132,6 +132,7 @@ def _first_vertices(scene, sensor, sampler, plan: Suffixes, places, walk: Surfac
     n_rays, numbers = _twin_numbers(sampler, plan)
     ray = first_rays(sensor, numbers, n_rays, 0, None)
     path, _ = walk.camera_vertex(UNLIMITED, scene, ray, numbers, mi.Bool(True))
+    dr.eval(ray, path)  # together: to gather from each of its parts would follow the rays once for each
     return fork(ray, plan.n_paths), fork(path, plan.n_paths), sampler
 
 
