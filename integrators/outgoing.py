@@ -39,8 +39,8 @@ OUTGOING_KEYS = """
      * - unbounded_share
        - |float|
        - Share of the training paths that run on to their natural end, without self-training: more where light enters
-         by many reflections, and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised`` 0.5; in
-         scenes with media 1, of ``neural_path`` without ``denoised`` 0.25)
+         by many reflections, and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised`` 0.5.
+         In scenes with media 1, of ``neural_path`` without ``denoised`` 0.25)
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first
@@ -110,8 +110,8 @@ class OutgoingIntegrator(CacheIntegrator):
         return OutgoingTraining.unbounded_share
 
     def default_unbounded_in_media(self, props) -> float:
-        """That share in scenes with participating media. All, over a quarter: denoised images of 8 samples by ``nrc`` had
-        0.83 (a cloud), 0.77 (a courtyard) and 0.70 (wax) of the squared error after 150 steps."""
+        """That share in scenes with participating media. With all of them denoised images of 8 samples by ``nrc`` have
+        0.83 (a cloud), 0.77 (a courtyard) and 0.70 (wax) of the squared error with a quarter, after 150 steps."""
         return 1.0
 
     def default_epsilon(self) -> float:

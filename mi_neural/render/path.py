@@ -320,7 +320,7 @@ def survival(path: PathState, rr_depth: int, share=1, most=0.95):
 def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None, most=0.95) -> tuple:
     """(the path, which may have ended, throughput divided by the probability that it has not; sampler).
 
-    E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together. `share`, `most`: see
+    E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together. `share`, `most`: of
     :func:`survival`.
     """
     q = survival(path, rr_depth, share, most)
