@@ -48,6 +48,7 @@ PATHS := -i path -i nirc -i nrc -i neural_path -i nirc_two_level -i nirc_two_lev
     -i plain_path:light_sampler.type=nvc_lights --steady 200 --frame-seconds 0.25
 DIRECT := -i path -i plain_path:light_sampler.type=power_lights -i plain_path:light_sampler.type=nvc_lights -i restir_di \
     -i nvc_direct -i nvc_direct:mode=neural -D max_depth=2 --steady 200 --frame-seconds 0.25 --reference-spp 512
+FOG := -i volpath -i plain_path:light_sampler.type=nvc_lights -i nrc -i neural_path --steady 200 --frame-seconds 0.25
 LAMP := lamp_panel.to_world=translate(0.7*sin(2*pi*t),-0.4*(1-cos(2*pi*t)),0)@value
 
 gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light: out/gallery/index.html; minutes, goes on where stopped
@@ -58,6 +59,7 @@ gallery: $(STAMP)  ## own scenes by every integrator, error maps, a moving light
 	$(GALLERY) lamp_bays $(DIRECT) --size 256x144 -o out/gallery/5_direct_light
 	$(BIN)/mi-neural sequence cornell_box -i path -i nirc:blend=reliability --change "$(LAMP)" --frames 36 --pretrain 128 \
 	    --spp 4 --size 128x128 --no-reference -o out/gallery/6_moving_light
+	$(GALLERY) foggy_hall $(FOG) --size 320x180 -o out/gallery/7_foggy_hall
 	$(BIN)/python -m mi_neural.bench.gallery out/gallery
 
 gallery-pictures: gallery  ## the README's pictures, of the gallery

@@ -51,6 +51,9 @@ class NeuralPathIntegrator(OutgoingIntegrator):
     def default_unbounded(self, props) -> float:
         return DENOISED_UNBOUNDED if props.get("denoised", False) else super().default_unbounded(props)
 
+    def default_unbounded_in_media(self, props) -> float:
+        return 1.0 if props.get("denoised", False) else super().default_unbounded(props)
+
     @property
     def caches(self) -> tuple[str, ...]:
         return ("outgoing",)
@@ -162,8 +165,9 @@ NeuralPathIntegrator.__doc__ = (
 
     In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
     scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
-    the throughput. The spread of a path has no angle there. Training paths start at the camera alone, whatever
-    ``world_share``, and ``roughening`` is refused.
+    the throughput. The spread of a path has no angle there. No path ends at rough glass around a medium. Training paths
+    start at the camera alone, whatever ``world_share``, and ``roughening`` is refused. Measured: ``mi-neural doc
+    media``.
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),

@@ -103,8 +103,8 @@ NRCIntegrator.__doc__ = (
 
     Training paths begin as those of pixels do, or at places that earlier ones have met; they go on beyond the terminal
     vertex until they have become as wide once more, where the cache completes them (self-training), and each vertex is
-    a record. One in 4 runs on without (``unbounded_share``). The reflectance is factored out of the records and
-    multiplied back.
+    a record. One in 4, in scenes with media each, runs on without (``unbounded_share``). The reflectance is factored
+    out of the records and multiplied back.
 
     .. pluginparameters::
 
@@ -164,8 +164,9 @@ NRCIntegrator.__doc__ = (
 
     In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
     scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
-    the throughput. The spread of a path has no angle there. Training paths start at the camera alone, whatever
-    ``world_share``, and ``roughening`` is refused.
+    the throughput. The spread of a path has no angle there. No path ends at rough glass around a medium. Training paths
+    start at the camera alone, whatever ``world_share``, and ``roughening`` is refused. Measured: ``mi-neural doc
+    media``.
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),

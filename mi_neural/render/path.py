@@ -309,20 +309,21 @@ def advance(path: PathState, found: Bounce, max_depth: int = NO_LIMIT) -> PathSt
     )  # fmt: skip
 
 
-def survival(path: PathState, rr_depth: int, share=1):
+def survival(path: PathState, rr_depth: int, share=1, most=0.95):
     """Probability that a path survives Russian roulette, 1 up to `rr_depth` bounces.
 
-    It is the throughput times `share`, at most 0.95, without the factor that refraction gives radiance (η²)."""
-    q = dr.minimum(dr.max(path.β * share) * dr.square(path.η), 0.95)
+    It is the throughput times `share`, at most `most`, without the factor that refraction gives radiance (η²)."""
+    q = dr.minimum(dr.max(path.β * share) * dr.square(path.η), most)
     return dr.select(path.depth > rr_depth, q, 1)
 
 
-def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None) -> tuple:
+def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None, most=0.95) -> tuple:
     """(the path, which may have ended, throughput divided by the probability that it has not; sampler).
 
-    E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together.
+    E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together. `share`, `most`: of
+    :func:`survival`.
     """
-    q = survival(path, rr_depth, share)
+    q = survival(path, rr_depth, share, most)
     u = sampler.next_1d() if u is None else u
     alive = path.active & (u < q) & (dr.max(path.β) > 0)
     return replace(path, β=path.β * dr.rcp(dr.maximum(q, 1e-6)), active=alive), sampler

@@ -21,6 +21,11 @@ def has_null(bsdf):
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
 
 
+def transmits(bsdf):
+    """Whether a BSDF has a lobe that transmits."""
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+
+
 def is_smooth(si, active):
     """Whether there is a surface with a non-delta lobe."""
     return active & si.is_valid() & has_smooth(si.bsdf())
@@ -57,4 +62,4 @@ def facing(si):
 
 def receiver(si, bsdf):
     """How a surface receives light, for choosing one: its normal on the side that is seen, and whether it transmits."""
-    return facing(si), mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+    return facing(si), transmits(bsdf)
