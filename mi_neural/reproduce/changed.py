@@ -86,7 +86,7 @@ def mean_reliabilities(integrator) -> dict[str, float]:
 class Measured:
     """Frames of all methods, as :func:`measure` found them.
 
-    curves  method -> "flip" and "smape" -> a value for each frame (SMAPE of frame 0 is None)
+    curves  method -> "flip" and "smape" -> a value for each frame (SMAPE of frame 0 is None); "flip 0" of crop 0
     crops   (x, y, width, height): where the change is strongest, and where it is weakest
     """
 
@@ -118,7 +118,7 @@ class Measured:
     def windows(self, method: str, name: str) -> list[float]:
         """Means of a curve before the change, over the first response, and from LATE frames after it; the frame of the
         change itself does not count for SMAPE, which would contain the change."""
-        after = CHANGE + (name == "smape")
+        after = CHANGE + name.startswith("smape")
         return [self.mean(method, name, 0, CHANGE - 1), self.mean(method, name, after, CHANGE + FIRST),
                 self.mean(method, name, self.late)]  # fmt: skip
 
@@ -145,9 +145,9 @@ def measure(work: Work, settings: Settings, change: Change) -> Measured:
     results = dict(zip(settings.methods, run.run(benchmark.make_cases(loaded, specs)), strict=True))
     direct = [direct_light(group, loaded, over_time, settings, frame) for frame in (0, CHANGE)]
     found = Measured(settings, run, results, direct, {}, [])
+    found.crops = plots.choose_crops(found.reference(CHANGE - 1), found.reference(CHANGE))
     found.curves = {m: group.part(f"errors_{m}", lambda bar, m=m: Part(_errors(found, m, bar))).numbers
                     for m in settings.methods}  # fmt: skip
-    found.crops = plots.choose_crops(found.reference(CHANGE - 1), found.reference(CHANGE))
     return found
 
 
@@ -170,13 +170,25 @@ def direct_light(group: Group, loaded, over_time: sequence.Sequence, settings: S
 
 
 def _errors(found: Measured, method: str, bar) -> dict[str, list[float | None]]:
-    """FLIP to the reference and SMAPE to the frame before, of all frames of one method."""
-    exposures, flips, smapes, previous = found.run.references.exposures, [], [], None
+    """FLIP to the reference and SMAPE to the frame before, of all frames of one method, as `flip` and `smape`; and of
+    the crops, as `flip 0`, `smape 0` and so on."""
+    exposures, previous, n = found.run.references.exposures, None, len(found.crops)
+    errors = {name + end: [] for name in ("flip", "smape") for end in ("", *(f" {k}" for k in range(n)))}
     for frame in range(found.settings.frames):
         image = found.clean(method, frame)
-        flips.append(metrics.flip(image, found.reference(frame), exposures).mean)
-        smapes.append(None if previous is None else metrics.smape(image, previous))
+        maps = {"flip": metrics.flip(image, found.reference(frame), exposures).map}
+        maps["smape"] = None if previous is None else metrics.smape_map(image, previous)
+        for name, values in maps.items():
+            errors[name].append(None if values is None else values.mean())
+            for k, crop in enumerate(found.crops):
+                errors[f"{name} {k}"].append(None if values is None else cut(values, crop).mean())
         previous = image
         if bar:
             bar(frame + 1, found.settings.frames)
-    return {"flip": flips, "smape": smapes}
+    return errors
+
+
+def cut(image: np.ndarray, crop: plots.Crop) -> np.ndarray:
+    """The part of an image or map that a crop (x, y, width, height) names."""
+    x, y, w, h = crop
+    return image[y : y + h, x : x + w]
