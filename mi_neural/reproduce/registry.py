@@ -6,11 +6,11 @@ import difflib
 
 from mi_neural.bench.load import InputError
 
-from . import reliability
+from . import nirc, reliability
 from .entry import SOURCES, Entry
 
 #: All entries by name, in the order of the list.
-ENTRIES: dict[str, Entry] = {e.name: e for e in (*reliability.ENTRIES,)}
+ENTRIES: dict[str, Entry] = {e.name: e for e in (*reliability.ENTRIES, *nirc.ENTRIES)}
 
 
 def find(name: str) -> list[Entry]:

@@ -1,0 +1,422 @@
+"""Counterparts of the figures of Dereviannykh et al. 2025: Neural Two-Level Monte Carlo Real-Time Rendering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_neural.bench import budget, load
+from mi_neural.bench.report import number
+from mi_neural.explore import figures
+from mi_neural.explore.views import Hemisphere
+from mi_neural.image import metrics
+
+from . import measures
+from .entry import Entry, Outcome, Statement
+from .work import Part, Work
+
+#: Paths that train in place of one for each 8x8 pixels: a small film would give a few dozen.
+PAPER = {"preset": "paper", "train_samples": 2048}
+NOTE_PAPER = (
+    "nirc has preset=paper, but trains with 2048 paths a frame; one for each 8x8 pixels is too few on this film."
+)
+
+# ------------------------------------------------------------------------------------------------------------------
+# What a sample costs
+
+
+@dataclass(frozen=True)
+class Cost:
+    """`counts`: samples a pixel, the first and the last of which give the cost of one more."""
+
+    size: tuple[int, int]
+    rounds: int
+    train: int
+    counts: tuple[int, ...] = (1, 4, 16)
+
+
+def cost(work: Work) -> Outcome:
+    """Time of a sample of the incident cache, of the outgoing cache, and of a path."""
+    settings = work.choose(Cost((96, 54), 3, 8), Cost((640, 360), 6, 16))
+    group = work.group("nirc-cost", settings)
+    times = group.part("times", lambda bar: Part(_cost(settings, bar))).numbers
+    first, last = (str(n) for n in (settings.counts[0], settings.counts[-1]))
+    each = {m: (of[last] - of[first]) / (settings.counts[-1] - settings.counts[0]) for m, of in times.items()}
+    table = [["ns of one more sample of a pixel", "ns", "path over it", "nrc over it"]]
+    table += [[m, number(1e9 * v), number(each["path"] / v), number(each["nrc"] / v)] for m, v in each.items()]
+    paper, own = each["path"] / each[PAPER_NET], each["path"] / each[OWN_NET]
+    of_nrc = [each["nrc"] / each[m] for m in (PAPER_NET, OWN_NET)]
+    reason = (
+        "on tensor cores the network is nearly free and tracing dominates; on a CPU a network of 4 layers of 64 takes "
+        "longer than tracing the short paths of a small scene"
+    )
+    statements = [
+        Statement(
+            "An evaluation takes 2 to 25 times less time than a path tracing sample", "abstract",
+            f"{number(paper)} times less with the paper's network, {number(own)} times with the default one",
+            bool(paper >= 2), f"{number(2 / paper)} times below the range" if paper < 2 else "", reason,
+        ),
+        Statement(
+            "Where many samples are taken, one of NIRC is 5 to 10 times cheaper than one of NRC", "project page",
+            f"{number(of_nrc[0])} times with the paper's network, {number(of_nrc[1])} times with the default one",
+            bool(of_nrc[0] >= 5), f"{number(5 / of_nrc[0])} times below the range" if of_nrc[0] < 5 else "", reason,
+        ),
+    ]  # fmt: skip
+    lines = {m: (settings.counts, [1e9 * of[str(n)] for n in settings.counts]) for m, of in times.items()}
+    drawn = figures.curves(lines, x="samples of a pixel", y="ns a pixel", log="xy", marks="o")
+    notes = [
+        "Bistro is not shipped. path and nrc take N camera samples a pixel; nirc takes one, with direct light, and "
+        "asks the cache in N directions. The cost of one more is taken between the least and the largest N, so that "
+        "direct light of the one camera sample does not count.",
+        "CPU seconds over the number of cores; nrc ends paths by its default rule, at the first wide vertex.",
+    ]
+    return Outcome(statements, {"Cost of a sample": table}, {"Time over samples": drawn.data()}, notes)
+
+
+PAPER_NET, OWN_NET = "nirc, paper's network", "nirc, default network"
+
+
+def _cost(settings: Cost, bar) -> dict[str, dict[str, float]]:
+    """Seconds of a pixel, by method and number of samples."""
+    loaded = load.load_scene("glossy_hall", settings.size)
+    integrators = {("path", n): (measures.make(loaded, "path"), n) for n in settings.counts}
+    nrc = measures.make(loaded, "nrc", train_steps=0)
+    measures.train(loaded, nrc, settings.train)
+    integrators |= {("nrc", n): (nrc, n) for n in settings.counts}
+    for name, keys in ((PAPER_NET, PAPER), (OWN_NET, {})):
+        common = {**keys, "termination": "primary", "spread_threshold": 0.0, "light_samples": 1, "train_steps": 0}
+        for n in settings.counts:
+            nirc = measures.make(loaded, "nirc", cache_samples=n, **common)
+            measures.train(loaded, nirc, settings.train)
+            integrators[name, n] = (nirc, 1)
+    times = measures.seconds_of(loaded, {k: v[0] for k, v in integrators.items()},
+                                {k: v[1] for k, v in integrators.items()}, settings.rounds, bar)  # fmt: skip
+    found: dict[str, dict[str, float]] = {}
+    for (m, n), seconds in times.items():
+        found.setdefault(m, {})[str(n)] = seconds / budget.pixels(loaded.scene)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Layers
+
+
+@dataclass(frozen=True)
+class Layers:
+    """`rounds`: passes that are timed."""
+
+    size: tuple[int, int]
+    train: int
+    spp: int
+    reference_spp: int
+    rounds: int = 4
+    layers: tuple[int, ...] = (2, 4, 6)
+
+
+#: MSE of two marked regions, and ms, with 2, 4 and 6 layers on an RTX 3080 (project page)
+PRINTED_MSE = ((0.56, 0.27, 0.14), (0.23, 0.21, 0.13))
+PRINTED_MS = (0.84, 1.24, 1.64)
+
+
+def layers(work: Work) -> Outcome:
+    """Error and time of the cache by its number of hidden layers."""
+    settings = work.choose(Layers((64, 64), 500, 16, 8192), Layers((256, 256), 2000, 64, 4096))
+    loaded = load.load_scene("cornell_box", settings.size)
+    reference = measures.reference(work, loaded, settings.reference_spp)
+    group = work.group("nirc-layers", settings)
+    images, found = {}, {}
+    for n in settings.layers:
+        part = group.part(f"layers_{n}", lambda bar, n=n: _layers(loaded, settings, n, bar))
+        images[n], found[n] = part.arrays["image"], part.numbers
+    errors = {n: metrics.relmse_trimmed(i, reference.rgb, reference.variance) for n, i in images.items()}
+    ms = {n: 1e3 * of["seconds"] for n, of in found.items()}
+    low, *_, high = settings.layers
+    fall, slower = errors[low] / errors[high], ms[high] / ms[low]
+    statements = [
+        Statement(
+            "MSE 0.56, 0.27, 0.14 with 2, 4, 6 layers (another region: 0.23, 0.21, 0.13): 4 and 1.8 times less with 6",
+            "project page, scalability",
+            f"relMSE {', '.join(number(v) for v in errors.values())}: {number(fall)} times less with {high}",
+            bool(fall > 1.3), f"{number(fall / 1.8)} times the smaller fall",
+            "the light that arrives in a diffuse box is smooth, so that 2 layers behind a hash grid are enough, and "
+            "deeper networks need more steps than they had here; the project page says that it does not always scale",
+        ),
+        Statement(
+            "0.84, 1.24, 1.64 ms: 1.95 times as long with 6 layers as with 2", "project page, scalability",
+            f"{', '.join(number(v) for v in ms.values())} ms: {number(slower)} times as long",
+            bool(abs(slower / 1.95 - 1) < 0.25), f"{100 * (slower / 1.95 - 1):+.0f} %",
+            "a pass holds direct light and the look-up in the grid, which do not grow with the layers",
+        ),
+    ]  # fmt: skip
+    table = [["layers", "MSE there", "MSE there, other region", "ms there", "relMSE here", "ms here"]]
+    for k, n in enumerate(settings.layers):
+        printed = [number(v[k]) for v in (*PRINTED_MSE, PRINTED_MS)] if k < 3 else ["", "", ""]
+        table.append([str(n), *printed, number(errors[n]), number(ms[n])])
+    shown = {f"{n} layers": images[n] for n in settings.layers} | {"reference": reference.rgb}
+    notes = {f"{n} layers": f"relMSE {number(errors[n])}" for n in settings.layers}
+    flips = {f"{n} layers": metrics.flip(i, reference.rgb).map for n, i in images.items()}
+    return Outcome(
+        statements, {"Layers": table},
+        {"Images": figures.pictures(shown, notes=notes, columns=4).data(),
+         "FLIP": figures.maps(flips, low=0, high=0.4, label="FLIP").data()},
+        [NOTE_PAPER, "The cache is queried at the first surface (termination=primary). MSE there is not relative; "
+         "compare ratios."],
+    )  # fmt: skip
+
+
+def _layers(loaded, settings: Layers, n: int, bar) -> Part:
+    keys = {**PAPER, "hidden_layers": n, "termination": "primary", "spread_threshold": 0.0, "train_steps": 0}
+    nirc = measures.make(loaded, "nirc", **keys)
+    measures.train(loaded, nirc, settings.train, bar)
+    image = measures.render(loaded, nirc, settings.spp, seed=1).rgb
+    seconds = measures.seconds_of(loaded, {"nirc": nirc}, {"nirc": 1}, settings.rounds)["nirc"]
+    return Part({"seconds": seconds}, {"image": image})
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Bias over bounces
+
+
+@dataclass(frozen=True)
+class Bounces:
+    """`thresholds`: constants c of the spread test at which paths stop earlier or later."""
+
+    size: tuple[int, int]
+    train: int
+    spp: int
+    reference_spp: int
+    thresholds: tuple[float, ...] = (0.0, 1e-3, 0.1, 1.0, 10.0)
+
+
+def bounces(work: Work) -> Outcome:
+    """Squared bias over the number of rays before the cache is asked."""
+    settings = work.choose(Bounces((64, 64), 200, 256, 8192), Bounces((256, 256), 1000, 1024, 16384))
+    loaded = load.load_scene("cornell_box", settings.size)
+    reference = measures.reference(work, loaded, settings.reference_spp)
+    group = work.group("nirc-bias", settings)
+    curves, images = {}, {"reference": reference.rgb}
+    for plugin in ("nrc", "nirc"):
+        part = group.part(f"stops_{plugin}", lambda bar, p=plugin: _stops(group, loaded, settings, p, bar))
+        bias = [metrics.bias_and_variance(list(pair), reference.rgb, reference.variance)[0]
+                for pair in part.arrays["images"]]  # fmt: skip
+        curves[plugin] = (part.numbers["depth"], bias)
+        images[f"{plugin}, earliest"] = part.arrays["images"][0].mean(axis=0)
+    base = curves["nrc"][0][0]  # the cache at the first surface: no ray of reflected light
+    rays = {m: [max(0.0, d - base) for d in depth] for m, (depth, _) in curves.items()}
+    first = {m: bias[0] for m, (_, bias) in curves.items()}
+    needed = next((r for r, b in zip(rays["nrc"], curves["nrc"][1], strict=True) if b <= max(first["nirc"], 0)), None)
+    text = "NRC does not reach it" if needed is None else f"NRC needs {needed:.2f} rays for that"
+    statements = [
+        Statement(
+            "NIRC can be asked at the first surface, where NRC needs further rays for the same bias", "project page",
+            f"squared bias at the first surface: nirc {number(first['nirc'])} at {rays['nirc'][0]:.2f} rays, nrc "
+            f"{number(first['nrc'])} at none; {text}",
+            bool(first["nirc"] < first["nrc"]), f"{number(first['nrc'] / max(first['nirc'], 1e-9))} times less bias",
+            "a diffuse box without textures is the outgoing cache's best case: what leaves a wall is as smooth as what "
+            "arrives, and no integral over directions is left to sample",
+        )
+    ]  # fmt: skip
+    table = [["", "c", "rays of reflected light", "squared bias"]]
+    for m, (_, bias) in curves.items():
+        table += [[m, number(c), f"{r:.2f}", number(b)]
+                  for c, r, b in zip(settings.thresholds, rays[m], bias, strict=True)]  # fmt: skip
+    lines = {m: (rays[m], np.maximum(bias, 1e-6)) for m, (_, bias) in curves.items()}
+    return Outcome(
+        statements, {"Bias": table},
+        {"Bias over rays": figures.curves(lines, x="rays of reflected light a sample", y="squared bias (relMSE)",
+                                          log="y", marks="o").data(),
+         "Earliest stop": figures.pictures(images, columns=3).data()},
+        ["Bias without the noise of the images, from products of two independent ones; it may come out negative where "
+         "it is below what the samples resolve, and is then drawn at 1e-6."],
+    )  # fmt: skip
+
+
+def _stops(group, loaded, settings: Bounces, plugin: str, bar) -> Part:
+    common = {"channels": "depth", "train_steps": 0}
+    trained = measures.make(loaded, plugin, **common)
+    measures.train(loaded, trained, settings.train)
+    images, depths = [], []
+    for k, c in enumerate(settings.thresholds):
+        integrator = measures.frozen(trained, loaded, group.folder, plugin, spread_threshold=c, **common)
+        integrator.plan_samples(1)  # so that what depends on the sample count stays at its most biased setting
+        size, *more = budget.plan_passes(loaded.scene, settings.spp)
+        pair, depth = [], []
+        for j in range(2):
+            passes = [budget.render_pass(loaded.scene, integrator, size, budget.pass_seed(2 * k + j, 0, i))
+                      for i in range(1 + len(more))]  # fmt: skip
+            rgb, channels = load.split_channels(np.mean(passes, axis=0), list(integrator.aov_names()))
+            pair.append(rgb)
+            depth.append(channels["depth"].mean())
+        images.append(np.stack(pair))
+        depths.append(float(np.mean(depth)))
+        if bar:
+            bar(k + 1, len(settings.thresholds))
+    return Part({"depth": depths}, {"images": np.stack(images).astype(np.float32)})
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Hemisphere
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """`pixels`: points (x, y) of the film, as shares of its width and height; `steps`: training frames."""
+
+    size: tuple[int, int]
+    disk: int
+    spp: int
+    steps: tuple[int, ...]
+    pixels: tuple[tuple[float, float], ...] = ((0.3, 0.85), (0.5, 0.3))
+
+
+def hemisphere(work: Work) -> Outcome:
+    """What the cache says of all directions at a point."""
+    settings = work.choose(Sphere((64, 64), 48, 256, (16, 200)), Sphere((256, 256), 96, 2048, (16, 200, 2000)))
+    group = work.group("nirc-hemisphere", settings)
+    part = group.part("hemispheres", lambda bar: _hemispheres(settings, bar))
+    names = [f"{n} frames" for n in settings.steps] + [f"paper's, {settings.steps[-1]} frames"]
+    inside = np.hypot(*np.mgrid[-1 : 1 : settings.disk * 1j, -1 : 1 : settings.disk * 1j]) < 1
+    shown, notes, errors, means = {}, {}, {n: [] for n in names}, {n: [] for n in names}
+    for k in range(len(settings.pixels)):
+        truth = part.arrays[f"traced_{k}"]
+        for j, n in enumerate(names):
+            title = f"point {k + 1}, {n}"
+            shown[title] = part.arrays[f"predicted_{k}_{j}"]
+            wrong = (shown[title] - truth)[inside]
+            errors[n].append(100 * float(np.sqrt(np.mean(wrong**2)) / truth[inside].mean()))
+            means[n].append(100 * abs(float(wrong.mean() / truth[inside].mean())))
+            notes[title] = f"rms error {errors[n][-1]:.0f} % of the mean"
+        shown[f"point {k + 1}, traced"] = truth
+    error, mean = ({n: float(np.mean(v)) for n, v in of.items()} for of in (errors, means))
+    first, last, paper = names[0], names[-2], names[-1]
+    statements = [
+        Statement(
+            "The cache learns the light that arrives from all directions", "project page, visualization",
+            f"rms error over directions {error[last]:.0f} % of the mean, mean over all directions off by "
+            f"{mean[last]:.0f} %, after {last}; with the paper's network {error[paper]:.0f} and {mean[paper]:.0f} %",
+            None, "", "the page shows a picture without a number. Spherical harmonics of degree 3 or 4 blur the edges "
+            "of what is seen from the point; what a diffuse surface needs, the mean, is nearer",
+        ),
+        Statement(
+            "Reasonable cache quality in 10 to 20 frames", "project page",
+            f"rms error {error[first]:.0f} % after {first}, {error[last]:.0f} % after {last}; mean off by "
+            f"{mean[first]:.0f} and {mean[last]:.0f} %",
+            bool(error[first] < 1.5 * error[last]), f"{number(error[first] / error[last])} times the later error",
+            "a frame has 4096 training paths here; the paper's has one for each 8x8 pixels of 1920x1080, eight times "
+            "as many",
+        ),
+    ]  # fmt: skip
+    drawn = figures.pictures(shown, notes=notes, columns=len(names) + 1, disk=True)
+    return Outcome(
+        statements, {}, {"Hemispheres": drawn.data()},
+        ["A disk holds the directions above a surface point of the Cornell box, seen along the normal, of equal areas "
+         "for equal solid angles. Emission is left out, as in the cache; black is the open front.", NOTE_PAPER],
+    )  # fmt: skip
+
+
+def _hemispheres(settings: Sphere, bar) -> Part:
+    loaded = load.load_scene("cornell_box", settings.size)
+    points = [(x * settings.size[0], y * settings.size[1]) for x, y in settings.pixels]
+    arrays, column = {}, 0
+    for keys, steps in (({}, settings.steps), (PAPER, settings.steps[-1:])):
+        nirc, trained = measures.make(loaded, "nirc", train_steps=0, **keys), 0
+        views = [Hemisphere(loaded.scene, nirc, p, size=settings.disk) for p in points]
+        for n in steps:
+            measures.train(loaded, nirc, n - trained, bar)
+            trained = n
+            for k, view in enumerate(views):
+                arrays[f"predicted_{k}_{column}"] = view.predicted()
+            column += 1
+    for k, view in enumerate(views):
+        for _ in range(settings.spp // 16):
+            view.add(16)
+        arrays[f"traced_{k}"] = view.traced
+    return Part({}, arrays)
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Two-level Monte Carlo
+
+
+@dataclass(frozen=True)
+class TwoLevel:
+    """`images`: independent ones, of `spp` samples each, from which the variance comes."""
+
+    size: tuple[int, int]
+    train: int
+    images: int
+    spp: int = 4
+    scenes: tuple[str, ...] = ("cornell_box", "glossy_hall")
+
+
+def two_level(work: Work) -> Outcome:
+    """Variance and time of the unbiased estimator against path tracing."""
+    settings = work.choose(TwoLevel((64, 36), 150, 8), TwoLevel((256, 144), 1000, 16))
+    group = work.group("nirc-two-level", settings)
+    table = [["scene", "", "variance of a sample", "over path", "time over path", "efficiency"]]
+    statements, pictures = [], {}
+    for scene in settings.scenes:
+        part = group.part(f"variance_{scene}", lambda bar, s=scene: _variance(settings, s, bar))
+        rows = part.numbers
+        for label, row in rows.items():
+            v, t = row["variance"] / rows["path"]["variance"], row["seconds"] / rows["path"]["seconds"]
+            table.append([scene, label, number(row["variance"]), number(v), number(t), number(1 / (v * t))])
+        v = rows[PAPER_TWO]["variance"] / rows["path"]["variance"]
+        t = rows[PAPER_TWO]["seconds"] / rows["path"]["seconds"]
+        statements.append(
+            Statement(
+                "Two-level Monte Carlo with NIRC reduces noise at equal time", "abstract",
+                f"{scene}: variance {number(v)} times path's at equal samples, {number(t)} times its time: "
+                f"{number(1 / (v * t))} times as efficient",
+                bool(v * t < 1), f"{number(v * t)} times the time for equal noise",
+                "with next-event estimation the noise lies in the light of single directions, which a smooth cache "
+                "does not know; and queries cost more on a CPU, see nirc/cost",
+            )
+        )  # fmt: skip
+        pictures[scene] = figures.pictures(
+            {label: part.arrays[f"image_{k}"] for k, label in enumerate(rows)},
+            notes={label: f"variance {number(row['variance'])}" for label, row in rows.items()},
+        ).data()
+    notes = [
+        "nirc_two_level with preset=paper, trained before with 2048 paths a frame, and with our defaults. Variance is "
+        "that of one camera sample over the squared brightness of its pixel, without the largest 0.1 %; time is CPU "
+        "time of a pass of equal samples.",
+    ]
+    return Outcome(statements, {"Efficiency": table}, pictures, notes)
+
+
+PAPER_TWO = "nirc_two_level, paper"
+
+
+def _variance(settings: TwoLevel, scene: str, bar) -> Part:
+    loaded = load.load_scene(scene, settings.size)
+    integrators = {"path": measures.make(loaded, "path")}
+    for label, keys in ((PAPER_TWO, PAPER), ("nirc_two_level", {})):
+        integrators[label] = measures.make(loaded, "nirc_two_level", train_steps=0, **keys)
+        measures.train(loaded, integrators[label], settings.train)
+    rows, arrays, n = {}, {}, len(integrators)
+    for k, (label, integrator) in enumerate(integrators.items()):
+        seeds = range(1, settings.images + 1)
+        images = [budget.render_pass(loaded.scene, integrator, settings.spp, s)[..., :3] for s in seeds]
+        rows[label] = {"variance": measures.relative_variance(images, settings.spp)}
+        arrays[f"image_{k}"] = images[0]
+        if bar:
+            bar(k + 1, n)
+    for label, seconds in measures.seconds_of(loaded, integrators, dict.fromkeys(integrators, settings.spp), 3).items():
+        rows[label]["seconds"] = seconds
+    return Part(rows, arrays)
+
+
+ENTRIES = (
+    Entry("nirc/cost", "Performance comparison", "What a sample of the incident cache costs beside a path and nrc.",
+          "glossy_hall", (60, 600), cost),
+    Entry("nirc/layers", "Figure 15, scalability", "Error and time of the cache with 2, 4 and 6 hidden layers.",
+          "cornell_box", (60, 600), layers),
+    Entry("nirc/bias", "Bias over indirect bounces", "How many rays the incident cache saves at equal bias.",
+          "cornell_box", (60, 600), bounces),
+    Entry("nirc/hemisphere", "NIRC visualization", "Light from all directions at a point: predicted and traced.",
+          "cornell_box", (60, 600), hemisphere),
+    Entry("nirc/two_level", "Two-Level Monte Carlo", "Noise and time of the unbiased estimator against path tracing.",
+          "cornell_box, glossy_hall", (60, 600), two_level),
+)  # fmt: skip
