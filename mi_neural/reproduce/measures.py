@@ -12,7 +12,7 @@ from mi_neural.bench import reference as references
 from mi_neural.bench.load import IntegratorSpec, LoadedScene
 from mi_neural.image.metrics import TRIM_FRACTION, luminance, relative_weights
 
-from .work import Work
+from .work import Part, Work
 
 
 def reference(work: Work, loaded: LoadedScene, spp: int) -> references.Reference:
@@ -80,3 +80,22 @@ def relative_variance(images: list[np.ndarray], spp: int) -> float:
     weights = relative_weights(luminance(stack.mean(axis=0)))[..., None]
     values = np.sort((stack.var(axis=0, ddof=1) * spp * weights).ravel())
     return float(values[: max(1, int(values.size * (1 - TRIM_FRACTION)))].mean())
+
+
+def direct_reference(group, loaded: LoadedScene, spp: int) -> np.ndarray:
+    """Direct light alone, by a light tree, of `spp` samples a pixel, shape (height, width, 3); kept in the group."""
+
+    def image(bar) -> Part:
+        # The type of a light sampler cannot be nested in keywords: dots in names
+        keys = {"max_depth": 2, "light_sampler.type": "tree_lights"}
+        return Part({}, {"image": render(loaded, make(loaded, "plain_path", **keys), spp, 12345, bar).rgb})
+
+    return group.part("reference", image).arrays["image"]
+
+
+def chromaticity_error(image: np.ndarray, reference: np.ndarray) -> float:
+    """Mean difference of chromaticity, sum of |r/(r+g+b) - r'/(r'+g'+b')| over the channels, over all pixels that are
+    brighter in the reference than a hundredth of its mean."""
+    sums = [np.maximum(i.sum(axis=-1, keepdims=True), 1e-12) for i in (image, reference)]
+    lit = sums[1][..., 0] > 0.01 * sums[1].mean()
+    return float(np.abs(image / sums[0] - reference / sums[1]).sum(axis=-1)[lit].mean())

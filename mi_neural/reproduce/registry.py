@@ -6,11 +6,18 @@ import difflib
 
 from mi_neural.bench.load import InputError
 
-from . import nirc, reliability
+from . import nirc, nvc, nvc_settings, reliability
 from .entry import SOURCES, Entry
 
 #: All entries by name, in the order of the list.
-ENTRIES: dict[str, Entry] = {e.name: e for e in (*reliability.ENTRIES, *nirc.ENTRIES)}
+ENTRIES: dict[str, Entry] = {
+    entry.name: entry
+    for entry in (
+        *reliability.ENTRIES,
+        *nirc.ENTRIES,
+        *sorted((*nvc.ENTRIES, *nvc_settings.ENTRIES), key=lambda entry: entry.name),
+    )
+}
 
 
 def find(name: str) -> list[Entry]:
