@@ -6,7 +6,7 @@ import difflib
 
 from mi_neural.bench.load import InputError
 
-from . import nirc, nvc, nvc_settings, reliability
+from . import fsr, nirc, nvc, nvc_settings, reliability
 from .entry import SOURCES, Entry
 
 #: All entries by name, in the order of the list.
@@ -16,6 +16,7 @@ ENTRIES: dict[str, Entry] = {
         *reliability.ENTRIES,
         *nirc.ENTRIES,
         *sorted((*nvc.ENTRIES, *nvc_settings.ENTRIES), key=lambda entry: entry.name),
+        *fsr.ENTRIES,
     )
 }
 
