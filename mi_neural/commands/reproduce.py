@@ -22,7 +22,6 @@ def reproduce(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="small: each in less than two minutes on two cores")] = False,
     size: options.Size = None,
-    seed: options.Seed = 0,
     variant: options.Variant = terminal.DEFAULT_VARIANT,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="folder for all results; NAME is a folder in it")
@@ -44,7 +43,7 @@ def reproduce(
     terminal.set_variant(variant)
     command = shlex.join(["mi-neural", *sys.argv[1:]])
     for entry in entries:
-        work = Work(output, quick, wanted, seed)
+        work = Work(output, quick, wanted)
         terminal.announce(f"{entry.name}: {entry.shows}")
         try:
             with terminal.Bars() as bars:

@@ -138,7 +138,7 @@ def measure(work: Work, settings: Settings, change: Change) -> Measured:
     group = work.group(f"change-{change.scene}", asdict(settings) | {"scene": change.scene, "change": change.what})
     loaded = load.load_scene(change.scene, settings.size, merge=False)
     over_time = sequence.Sequence(loaded.scene, change.functions, settings.frames, CHANGE)
-    plan = sequence.Plan(settings.spp, settings.pretrain, work.seed)
+    plan = sequence.Plan(settings.spp, settings.pretrain)
     run = Watched(loaded, over_time, plan, group.folder / "frames", settings.reference_spp, progress=work.progress)
     keys = {**COMMON, "cache_samples": settings.cache_samples}
     specs = [IntegratorSpec("nirc", {**keys, **METHODS[m]}) for m in settings.methods]

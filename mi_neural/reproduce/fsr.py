@@ -265,7 +265,7 @@ def training_budget(work: Work) -> Outcome:
 
 ENTRIES = (
     Entry("fsr/overrides", "Tuning and Optimization", "Learning rate and weight smoothing: flicker against response.",
-          "cornell_box", (60, 600), overrides),
+          "cornell_box", (50, 1800), overrides),
     Entry("fsr/budget", "Context Creation", "Share of the pixels that train: error against time.",
-          "cornell_box", (60, 600), training_budget),
+          "cornell_box", (40, 1200), training_budget),
 )  # fmt: skip

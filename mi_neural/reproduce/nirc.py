@@ -99,82 +99,6 @@ def _cost(settings: Cost, bar) -> dict[str, dict[str, float]]:
 
 
 # ------------------------------------------------------------------------------------------------------------------
-# Layers
-
-
-@dataclass(frozen=True)
-class Layers:
-    """`rounds`: passes that are timed."""
-
-    size: tuple[int, int]
-    train: int
-    spp: int
-    reference_spp: int
-    rounds: int = 4
-    layers: tuple[int, ...] = (2, 4, 6)
-
-
-#: MSE of two marked regions, and ms, with 2, 4 and 6 layers on an RTX 3080 (project page)
-PRINTED_MSE = ((0.56, 0.27, 0.14), (0.23, 0.21, 0.13))
-PRINTED_MS = (0.84, 1.24, 1.64)
-
-
-def layers(work: Work) -> Outcome:
-    """Error and time of the cache by its number of hidden layers."""
-    settings = work.choose(Layers((64, 64), 500, 16, 8192), Layers((256, 256), 2000, 64, 4096))
-    loaded = load.load_scene("cornell_box", settings.size)
-    reference = measures.reference(work, loaded, settings.reference_spp)
-    group = work.group("nirc-layers", settings)
-    images, found = {}, {}
-    for n in settings.layers:
-        part = group.part(f"layers_{n}", lambda bar, n=n: _layers(loaded, settings, n, bar))
-        images[n], found[n] = part.arrays["image"], part.numbers
-    errors = {n: metrics.relmse_trimmed(i, reference.rgb, reference.variance) for n, i in images.items()}
-    ms = {n: 1e3 * of["seconds"] for n, of in found.items()}
-    low, *_, high = settings.layers
-    fall, slower = errors[low] / errors[high], ms[high] / ms[low]
-    statements = [
-        Statement(
-            "MSE 0.56, 0.27, 0.14 with 2, 4, 6 layers (another region: 0.23, 0.21, 0.13): 4 and 1.8 times less with 6",
-            "project page, scalability",
-            f"relMSE {', '.join(number(v) for v in errors.values())}: {number(fall)} times less with {high}",
-            bool(fall > 1.3), f"{number(fall / 1.8)} times the smaller fall",
-            "the light that arrives in a diffuse box is smooth, so that 2 layers behind a hash grid are enough, and "
-            "deeper networks need more steps than they had here; the project page says that it does not always scale",
-        ),
-        Statement(
-            "0.84, 1.24, 1.64 ms: 1.95 times as long with 6 layers as with 2", "project page, scalability",
-            f"{', '.join(number(v) for v in ms.values())} ms: {number(slower)} times as long",
-            bool(abs(slower / 1.95 - 1) < 0.25), f"{100 * (slower / 1.95 - 1):+.0f} %",
-            "a pass holds direct light and the look-up in the grid, which do not grow with the layers",
-        ),
-    ]  # fmt: skip
-    table = [["layers", "MSE there", "MSE there, other region", "ms there", "relMSE here", "ms here"]]
-    for k, n in enumerate(settings.layers):
-        printed = [number(v[k]) for v in (*PRINTED_MSE, PRINTED_MS)] if k < 3 else ["", "", ""]
-        table.append([str(n), *printed, number(errors[n]), number(ms[n])])
-    shown = {f"{n} layers": images[n] for n in settings.layers} | {"reference": reference.rgb}
-    notes = {f"{n} layers": f"relMSE {number(errors[n])}" for n in settings.layers}
-    flips = {f"{n} layers": metrics.flip(i, reference.rgb).map for n, i in images.items()}
-    return Outcome(
-        statements, {"Layers": table},
-        {"Images": figures.pictures(shown, notes=notes, columns=4).data(),
-         "FLIP": figures.maps(flips, low=0, high=0.4, label="FLIP").data()},
-        [NOTE_PAPER, "The cache is queried at the first surface (termination=primary). MSE there is not relative; "
-         "compare ratios."],
-    )  # fmt: skip
-
-
-def _layers(loaded, settings: Layers, n: int, bar) -> Part:
-    keys = {**PAPER, "hidden_layers": n, "termination": "primary", "spread_threshold": 0.0, "train_steps": 0}
-    nirc = measures.make(loaded, "nirc", **keys)
-    measures.train(loaded, nirc, settings.train, bar)
-    image = measures.render(loaded, nirc, settings.spp, seed=1).rgb
-    seconds = measures.seconds_of(loaded, {"nirc": nirc}, {"nirc": 1}, settings.rounds)["nirc"]
-    return Part({"seconds": seconds}, {"image": image})
-
-
-# ------------------------------------------------------------------------------------------------------------------
 # Bias over bounces
 
 
@@ -410,13 +334,11 @@ def _variance(settings: TwoLevel, scene: str, bar) -> Part:
 
 ENTRIES = (
     Entry("nirc/cost", "Performance comparison", "What a sample of the incident cache costs beside a path and nrc.",
-          "glossy_hall", (60, 600), cost),
-    Entry("nirc/layers", "Figure 15, scalability", "Error and time of the cache with 2, 4 and 6 hidden layers.",
-          "cornell_box", (60, 600), layers),
+          "glossy_hall", (20, 300), cost),
     Entry("nirc/bias", "Bias over indirect bounces", "How many rays the incident cache saves at equal bias.",
-          "cornell_box", (60, 600), bounces),
+          "cornell_box", (20, 600), bounces),
     Entry("nirc/hemisphere", "NIRC visualization", "Light from all directions at a point: predicted and traced.",
-          "cornell_box", (60, 600), hemisphere),
+          "cornell_box", (10, 300), hemisphere),
     Entry("nirc/two_level", "Two-Level Monte Carlo", "Noise and time of the unbiased estimator against path tracing.",
-          "cornell_box, glossy_hall", (60, 600), two_level),
+          "cornell_box, glossy_hall", (25, 600), two_level),
 )  # fmt: skip

@@ -285,11 +285,11 @@ def _seconds(settings: Times, size: tuple[int, int], bar) -> dict[str, float]:
 
 ENTRIES = (
     Entry("nvc/fig4", "Figures 3 and 4", "Neural direct light; training points in the air, on surfaces, or both.",
-          "lamp_bays", (60, 600), figure_4),
+          "lamp_bays", (10, 300), figure_4),
     Entry("nvc/fig5", "Figure 5", "Predicted visibility clamped to nearly 0 and to 0.001: bias and noise.",
-          "lamp_bays", (60, 600), figure_5),
+          "lamp_bays", (15, 600), figure_5),
     Entry("nvc/fig7", "Figure 7", "ReSTIR where every pixel is disoccluded, with clustered visibility.",
-          "lamp_bays", (60, 600), figure_7),
+          "lamp_bays", (10, 300), figure_7),
     Entry("nvc/times", "Section 4.3", "A query of 32 visibilities against 32 shadow rays, and a training step.",
-          "lamp_bays", (60, 300), times),
+          "lamp_bays", (5, 30), times),
 )  # fmt: skip

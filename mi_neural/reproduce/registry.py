@@ -6,7 +6,7 @@ import difflib
 
 from mi_neural.bench.load import InputError
 
-from . import fsr, nirc, nvc, nvc_settings, reliability
+from . import fsr, nirc, nirc_images, nvc, nvc_settings, reliability
 from .entry import SOURCES, Entry
 
 #: All entries by name, in the order of the list.
@@ -14,7 +14,7 @@ ENTRIES: dict[str, Entry] = {
     entry.name: entry
     for entry in (
         *reliability.ENTRIES,
-        *nirc.ENTRIES,
+        *sorted((*nirc.ENTRIES, *nirc_images.ENTRIES), key=lambda entry: entry.name),
         *sorted((*nvc.ENTRIES, *nvc_settings.ENTRIES), key=lambda entry: entry.name),
         *fsr.ENTRIES,
     )

@@ -66,15 +66,14 @@ class Work:
     folder    of all results; `measured` below it holds finished parts
     quick     whether to measure small
     size      (width, height) of the film, in place of the entry's own
-    seed      of images
     progress  called with the name of each step; gives a callable (done, total), or None
     """
 
     def __init__(
-        self, folder: Path, quick: bool = False, size: tuple[int, int] | None = None, seed: int = 0,
+        self, folder: Path, quick: bool = False, size: tuple[int, int] | None = None,
         progress: Callable[[str], Progress | None] | None = None,
     ) -> None:  # fmt: skip
-        self.folder, self.quick, self.size, self.seed = folder, quick, size, seed
+        self.folder, self.quick, self.size = folder, quick, size
         self.progress = progress or (lambda text: None)
         self.settings: dict[str, object] = {}
 
@@ -91,6 +90,6 @@ class Work:
 
         values = dict(settings) if isinstance(settings, Mapping) else asdict(settings)
         self.settings |= values
-        key = {**values, "seed": self.seed, "variant": mi.variant(), "version": mi_neural.__version__}
+        key = {**values, "variant": mi.variant(), "version": mi_neural.__version__}
         digest = hashlib.sha256(json.dumps(plain(key), sort_keys=True).encode()).hexdigest()[:10]
         return Group(self.folder / "measured" / f"{name}-{digest}", self.progress)
