@@ -2,13 +2,17 @@
 
 import html
 import json
+from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from mi_neural.caches.reliability import Reliability, ReliabilityGrid
 from mi_neural.cli import app
-from mi_neural.reproduce import registry, reliability
+from mi_neural.reproduce import fsr, measures, registry, reliability
+from mi_neural.reproduce.changed import mean_reliabilities
 from mi_neural.reproduce.entry import SOURCES, Entry, Outcome, Statement
 from mi_neural.reproduce.work import Part, Work
 
@@ -100,3 +104,48 @@ def test_quick_counterpart_shows_both_numbers(tmp_path, monkeypatch):
     found = json.loads((tmp_path / "reliability/fig4/results.json").read_text())
     flip = {line[0]: [float(v) for v in line[1:4]] for line in found["tables"]["Means over the frames"][1:]}
     assert all(before < after for before, after, _ in flip.values()), "a moved lamp makes every cache wrong"
+
+
+# ---------------------------------------------------------------- measures
+
+
+def test_mean_reliability_tells_a_predictor_that_follows_the_targets_from_one_that_does_not(rng):
+    grid = ReliabilityGrid([0, 0, 0], [1, 1, 1], Reliability(measure="correlation", resolution=1))
+    n = 4096
+    for _ in range(3):
+        y, other = (mi.Color3f(rng.uniform(0, 1, (3, n)).astype("f4")) for _ in range(2))
+        place, normal = mi.Point3f(rng.uniform(0.1, 0.9, (3, n)).astype("f4")), mi.Normal3f(0, 0, 1)
+        grid.update(place, normal, mi.Bool([True] * n), y, y, other)
+    found = mean_reliabilities(SimpleNamespace(cache=SimpleNamespace(queried=SimpleNamespace(grid=grid))))
+    # Var y is 1/12, so that ε = 0.001 leaves 0.988; the other correlation has a standard deviation of 1/sqrt(3 n)
+    assert found["reliability_trained"] == pytest.approx(1 / (1 + 12e-3), abs=0.005)
+    assert abs(found["reliability_averaged"]) < 0.05
+    assert mean_reliabilities(SimpleNamespace(cache=SimpleNamespace(queried=None))) == {}
+
+
+def test_chromaticity_error_sees_colour_and_not_brightness(rng):
+    reference = rng.uniform(0.5, 1.0, (4, 5, 3))
+    assert measures.chromaticity_error(3.0 * reference, reference) == pytest.approx(0.0, abs=1e-12)
+    white, red = np.ones((2, 2, 3)), np.array([1.0, 0.0, 0.0]) * np.ones((2, 2, 3))
+    assert measures.chromaticity_error(red, white) == pytest.approx(4 / 3)
+    dark = np.vstack([white, 1e-6 * white])
+    assert measures.chromaticity_error(np.vstack([white, red]), dark) == 0.0, "what is black is left out"
+
+
+def test_relative_variance_is_that_of_one_sample(rng):
+    images = list(2.0 + 0.5 * rng.standard_normal((400, 8, 8, 3)))  # of 4 samples each
+    # 4 Var / mean², with relMSE's 0.01; without the largest of 192 values, which lowers it by 0.1 %
+    assert measures.relative_variance(images, 4) == pytest.approx(4 * 0.25 / 4 / 1.01, rel=0.03)
+
+
+def test_renderer_of_ones_own_learns_the_light_and_notices_a_change(tmp_path):
+    settings = fsr.Settings((16, 16), before=24, after=1, truth=128)
+    part = fsr.run(Work(tmp_path).group("fsr", settings), settings, 0.01, 0.0, 1.0)
+    error = part.numbers["error"]
+    assert np.mean(error[20:24]) < 0.25 * np.mean(error[:3]), "the cache learns"
+    assert error[24] > 2.0 * np.mean(error[20:24]), "the lamp has moved"
+    assert part.arrays["image_0"].shape == (16, 16, 3) and part.numbers["flicker"][0] is None
+
+
+def test_quick_entries_are_said_to_take_less_than_two_minutes():
+    assert all(0 < quick < 120 and quick < full for quick, full in (e.seconds for e in registry.ENTRIES.values()))

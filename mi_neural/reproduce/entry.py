@@ -71,7 +71,8 @@ class Entry:
     figure   what it is the counterpart of, as "Figure 4"
     shows    one sentence
     scene    names of shipped scenes
-    seconds  what it takes on two cores with nothing else running: with --quick, and without
+    seconds  what it takes on two cores with nothing else running: with --quick, as measured (CPU seconds over two), and
+             without, as estimated from that
     measure  does the work and gives the outcome; what it has finished is kept, see :class:`.work.Work`
     """
 

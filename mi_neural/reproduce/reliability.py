@@ -90,6 +90,21 @@ def _windows(found: Measured) -> list[list[str]]:
     return [head, *([m, *(number(v) for n in ("flip", "smape") for v in found.windows(m, n))] for m in found.curves)]
 
 
+def _noisy(found: Measured) -> list[list[str]]:
+    """Sums of FLIP from the change on and means of SMAPE, without and with the noise of direct light."""
+    head = ["", "FLIP, sum after", "with direct light's noise", "SMAPE before", "with its noise",
+            f"SMAPE from {found.late}", "with its noise"]  # fmt: skip
+    lines = []
+    for m, result in found.results.items():
+        rows = result.rows
+        smape = [np.mean([row["smape"] for row in rows[a:b]]) for a, b in ((1, CHANGE), (found.late, None))]
+        before, _, late = found.windows(m, "smape")
+        values = [sum(found.curves[m]["flip"][CHANGE:]), sum(row["flip"] for row in rows[CHANGE:]), before, smape[0],
+                  late, smape[1]]  # fmt: skip
+        lines.append([m, *(number(float(v)) for v in values)])
+    return [head, *lines]
+
+
 # ------------------------------------------------------------------------------------------------------------------
 # Figure 1
 
@@ -176,7 +191,7 @@ def figure_4(work: Work) -> Outcome:
         shown |= {f"{m}, frame {k}": found.clean(m, k) for k in frames}
     return Outcome(
         statements,
-        {"Means over the frames": _windows(found)},
+        {"Means over the frames": _windows(found), "What direct light's noise hides": _noisy(found)},
         {
             "FLIP": _curve(found, "flip", "HDR-FLIP to the reference"),
             "SMAPE": _curve(found, "smape", "SMAPE to the frame before"),
