@@ -71,6 +71,7 @@ def test_interrupted_entry_goes_on_without_measuring_again(tmp_path, monkeypatch
     page = (tmp_path / "fsr/fake/index.html").read_text()
     shown = ("error 0.3", "table 9", "0.25, 0.5", "differs, -17 %: another scene", "&lt;a note&gt;")
     assert all(text in page for text in shown)
+    assert 'href="fsr/fake/index.html"' in (index := (tmp_path / "index.html").read_text()) and "1 differs" in index
 
     assert run("fsr/fake", "-o", str(tmp_path), "--size", "8x8").exit_code == 0
     assert measured[3:] == ["first", "second"], "another size is another measurement"

@@ -18,6 +18,8 @@ SOURCES = {
     "nvc": "Bokšanský, Meister: Neural Visibility Cache for Real-Time Light Sampling, 2025",
     "fsr": "Advanced Micro Devices, Inc.: AMD FSR Radiance Caching (Preview), version 0.9.0, 2025",
 }
+#: What `Statement.agrees` means.
+WORDS = {True: "agrees", False: "differs", None: "not comparable"}
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,7 @@ class Statement:
     @property
     def verdict(self) -> str:
         """Whether both agree, by how much they differ, and why."""
-        word = {True: "agrees", False: "differs", None: "not comparable"}[self.agrees]
-        head = ", ".join(part for part in (word, self.distance) if part)
+        head = ", ".join(part for part in (WORDS[self.agrees], self.distance) if part)
         return head if self.agrees or not self.reason else f"{head}: {self.reason}"
 
 

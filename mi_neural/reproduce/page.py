@@ -13,7 +13,7 @@ from mi_neural.bench.benchmark import plain
 from mi_neural.bench.page import style
 from mi_neural.image import exr
 
-from .entry import Entry, Outcome
+from .entry import WORDS, Entry, Outcome
 from .work import Work
 
 MORE_STYLE = """
@@ -39,18 +39,38 @@ def statement_cells(outcome: Outcome) -> list[list[str]]:
 
 
 def write(entry: Entry, outcome: Outcome, work: Work, command: str, environment: dict[str, object]) -> Path:
-    """Write `index.html`, `results.json` and the pictures as files into the entry's folder; returns the page."""
+    """Write `index.html`, `results.json` and the pictures as files into the entry's folder, and the index of all
+    entries; returns the page."""
     folder = work.folder / entry.name
     folder.mkdir(parents=True, exist_ok=True)
     for title, data in outcome.pictures.items():
         exr.write_bytes(folder / f"{_slug(title)}.{_kind(data)}", data)
     results = {
-        "entry": entry.name, "figure": entry.figure, "source": entry.source, "command": command, "quick": work.quick,
+        "entry": entry.name, "figure": entry.figure, "shows": entry.shows, "source": entry.source,
+        "command": command, "quick": work.quick,
         "settings": work.settings, "environment": environment, "notes": outcome.notes, "tables": outcome.tables,
         "statements": [vars(s) | {"verdict": s.verdict} for s in outcome.statements],
     }  # fmt: skip
     exr.write_text(folder / "results.json", json.dumps(plain(results), indent=1) + "\n")
     exr.write_text(folder / "index.html", page(entry, outcome, work, command, environment))
+    write_index(work.folder)
+    return folder / "index.html"
+
+
+def write_index(folder: Path) -> Path:
+    """Write `index.html` of all entries that have results below a folder; returns it."""
+    lines = []
+    for path in sorted(folder.glob("*/*/results.json")):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        name, agree = html.escape(found["entry"]), [s["agrees"] for s in found["statements"]]
+        counts = ", ".join(f"{agree.count(k)} {word}" for k, word in WORDS.items() if agree.count(k))
+        texts = (found["figure"], found["shows"], counts, "quick" if found["quick"] else "")
+        cells = [f'<a href="{name}/index.html">{name}</a>', *map(html.escape, texts)]
+        lines.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    head = "<tr><th>name</th><th>counterpart of</th><th>what it shows</th><th>statements</th><th></th></tr>"
+    title = "Figures of the sources, and here"
+    body = f'<h1>{title}</h1>\n<section class="text"><table>{head}{"".join(lines)}</table></section>'
+    exr.write_text(folder / "index.html", PAGE.format(title=title, style=style() + MORE_STYLE, body=body))
     return folder / "index.html"
 
 
