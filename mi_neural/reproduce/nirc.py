@@ -115,7 +115,7 @@ class Bounces:
 
 def bounces(work: Work) -> Outcome:
     """Squared bias over the number of rays before the cache is asked."""
-    settings = work.choose(Bounces((64, 64), 200, 256, 8192), Bounces((256, 256), 1000, 1024, 16384))
+    settings = work.choose(Bounces((64, 64), 200, 256, 8192), Bounces((256, 256), 1000, 256, 4096))
     loaded = load.load_scene("cornell_box", settings.size)
     reference = measures.reference(work, loaded, settings.reference_spp)
     group = work.group("nirc-bias", settings)
@@ -336,7 +336,7 @@ ENTRIES = (
     Entry("nirc/cost", "Performance comparison", "What a sample of the incident cache costs beside a path and nrc.",
           "glossy_hall", (20, 300), cost),
     Entry("nirc/bias", "Bias over indirect bounces", "How many rays the incident cache saves at equal bias.",
-          "cornell_box", (20, 600), bounces),
+          "cornell_box", (20, 1200), bounces),
     Entry("nirc/hemisphere", "NIRC visualization", "Light from all directions at a point: predicted and traced.",
           "cornell_box", (10, 300), hemisphere),
     Entry("nirc/two_level", "Two-Level Monte Carlo", "Noise and time of the unbiased estimator against path tracing.",

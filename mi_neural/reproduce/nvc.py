@@ -230,9 +230,9 @@ def figure_8(work: Work) -> Outcome:
 
 ENTRIES = (
     Entry("nvc/fig1", "Figures 1 and 9", "ReSTIR, neural light sampling and neural direct illumination, converged.",
-          "lamp_bays", (35, 1200), figure_1),
+          "lamp_bays", (35, 2400), figure_1),
     Entry("nvc/fig6", "Figure 6", "Error over 128 frames from an empty cache: NRC-DI, neural sampling, ReSTIR.",
-          "lamp_bays", (35, 1200), figure_6),
+          "lamp_bays", (35, 2400), figure_6),
     Entry("nvc/fig8", "Figure 8", "Colour shifts of a radiance cache of direct light.",
-          "lamp_bays", (35, 1200), figure_8),
+          "lamp_bays", (35, 2400), figure_8),
 )  # fmt: skip
