@@ -64,6 +64,8 @@ def test_interrupted_entry_goes_on_without_measuring_again(tmp_path, monkeypatch
 
     entry = Entry("fsr/fake", "Table 9", "Two parts.", "none", (1, 1), measure)
     monkeypatch.setattr(registry, "ENTRIES", {entry.name: entry})
+    (tmp_path / "nvc/old").mkdir(parents=True)
+    (tmp_path / "nvc/old/results.json").write_text("{}")  # of another version: does not matter
     stopped = run("fsr/fake", "-o", str(tmp_path))
     assert stopped.exit_code == 130 and "goes on from here" in stopped.stderr
     assert run("fsr/fake", "-o", str(tmp_path)).exit_code == 0

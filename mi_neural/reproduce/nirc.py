@@ -139,7 +139,15 @@ def bounces(work: Work) -> Outcome:
             bool(first["nirc"] < first["nrc"]), f"{number(first['nrc'] / max(first['nirc'], 1e-9))} times less bias",
             "a diffuse box without textures is the outgoing cache's best case: what leaves a wall is as smooth as what "
             "arrives, and no integral over directions is left to sample",
-        )
+        ),
+        *(
+            Statement(
+                f"The bias falls with the bounces before the cache is asked ({m})", "project page, bias plot",
+                f"from {number(bias[0])} at {rays[m][0]:.2f} rays to {number(bias[-1])} at {rays[m][-1]:.2f}",
+                bool(bias[-1] < bias[0]), f"{number(bias[-1] / bias[0])} times", REASON_BIAS,
+            )
+            for m, (_, bias) in curves.items()
+        ),
     ]  # fmt: skip
     table = [["", "c", "rays of reflected light", "squared bias"]]
     for m, (_, bias) in curves.items():
@@ -154,6 +162,13 @@ def bounces(work: Work) -> Outcome:
         ["Bias without the noise of the images, from products of two independent ones; it may come out negative where "
          "it is below what the samples resolve, and is then drawn at 1e-6."],
     )  # fmt: skip
+
+
+REASON_BIAS = (
+    "c makes nirc gather what is near, and far light stays with the cache. The cache blurs near and far directions "
+    "into one another, and these errors cancel in the integral over directions; where the near part alone is replaced, "
+    "the far part's error is left. The paper's heuristic (termination=balanced) follows directions by chance"
+)
 
 
 def _stops(group, loaded, settings: Bounces, plugin: str, bar) -> Part:

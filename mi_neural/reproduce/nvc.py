@@ -117,8 +117,8 @@ def figure_1(work: Work) -> Outcome:
             "section 4.1",
             f"{number(flip['NLS'])} and {number(flip['ReSTIR'])}: {less:+.0f} %", bool(less <= -20),
             f"{less + 20:+.0f} percentage points from the smaller of both" if less > -20 else "",
-            "our ReSTIR is unbiased and tests visibility where a sample goes, with which it has less noise than the "
-            "paper's 3.61 ms version may have; the size of the film changes what 32 pixels of reuse are",
+            "our ReSTIR is unbiased and tests visibility wherever a sample goes, which costs rays and saves noise; and "
+            "its 32 pixels of reuse are a larger part of a small film",
         ),
         Statement(
             "Neural DI has significantly less error than both", "section 4.1, figure 1",

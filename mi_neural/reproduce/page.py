@@ -61,17 +61,23 @@ def write_index(folder: Path) -> Path:
     """Write `index.html` of all entries that have results below a folder; returns it."""
     lines = []
     for path in sorted(folder.glob("*/*/results.json")):
-        found = json.loads(path.read_text(encoding="utf-8"))
-        name, agree = html.escape(found["entry"]), [s["agrees"] for s in found["statements"]]
-        counts = ", ".join(f"{agree.count(k)} {word}" for k, word in WORDS.items() if agree.count(k))
-        texts = (found["figure"], found["shows"], counts, "quick" if found["quick"] else "")
-        cells = [f'<a href="{name}/index.html">{name}</a>', *map(html.escape, texts)]
-        lines.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+        try:
+            lines.append(_index_line(json.loads(path.read_text(encoding="utf-8"))))
+        except (KeyError, TypeError, ValueError):
+            continue  # damaged, or of another version
     head = "<tr><th>name</th><th>counterpart of</th><th>what it shows</th><th>statements</th><th></th></tr>"
     title = "Figures of the sources, and here"
     body = f'<h1>{title}</h1>\n<section class="text"><table>{head}{"".join(lines)}</table></section>'
     exr.write_text(folder / "index.html", PAGE.format(title=title, style=style() + MORE_STYLE, body=body))
     return folder / "index.html"
+
+
+def _index_line(found: dict) -> str:
+    name, agree = html.escape(found["entry"]), [s["agrees"] for s in found["statements"]]
+    counts = ", ".join(f"{agree.count(k)} {word}" for k, word in WORDS.items() if agree.count(k))
+    texts = (found["figure"], found["shows"], counts, "quick" if found["quick"] else "")
+    cells = [f'<a href="{name}/index.html">{name}</a>', *map(html.escape, texts)]
+    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
 def page(entry: Entry, outcome: Outcome, work: Work, command: str, environment: dict[str, object]) -> str:
