@@ -104,13 +104,21 @@ def _cost(settings: Cost, bar) -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True)
 class Bounces:
-    """`thresholds`: constants c of the spread test at which paths stop earlier or later."""
+    """`thresholds`: constants c of the spread test at which paths stop earlier or later; `chances`: values of
+    ``cache_samples`` by which they do so with ``termination="balanced"``."""
 
     size: tuple[int, int]
     train: int
     spp: int
     reference_spp: int
     thresholds: tuple[float, ...] = (0.0, 1e-3, 0.1, 1.0, 10.0)
+    chances: tuple[int, ...] = (64, 16, 4, 1)
+
+    def stops(self) -> dict[str, tuple[str, list[dict]]]:
+        """By name of a curve, a plugin and the keys of its points, from the earliest stop on."""
+        spread = [{"spread_threshold": c} for c in self.thresholds]
+        chance = [{"cache_samples": n, "termination": "balanced"} for n in self.chances]
+        return {"nrc": ("nrc", spread), "nirc": ("nirc", spread), "nirc, balanced": ("nirc", chance)}
 
 
 def bounces(work: Work) -> Outcome:
@@ -120,12 +128,12 @@ def bounces(work: Work) -> Outcome:
     reference = measures.reference(work, loaded, settings.reference_spp)
     group = work.group("nirc-bias", settings)
     curves, images = {}, {"reference": reference.rgb}
-    for plugin in ("nrc", "nirc"):
-        part = group.part(f"stops_{plugin}", lambda bar, p=plugin: _stops(group, loaded, settings, p, bar))
+    for name, (plugin, keys) in settings.stops().items():
+        part = group.part(f"stops_{name}", lambda bar, p=plugin, k=keys: _stops(group, loaded, settings, p, k, bar))
         bias = [metrics.bias_and_variance(list(pair), reference.rgb, reference.variance)[0]
                 for pair in part.arrays["images"]]  # fmt: skip
-        curves[plugin] = (part.numbers["depth"], bias)
-        images[f"{plugin}, earliest"] = part.arrays["images"][0].mean(axis=0)
+        curves[name] = (part.numbers["depth"], bias)
+        images[f"{name}, earliest"] = part.arrays["images"][0].mean(axis=0)
     base = curves["nrc"][0][0]  # the cache at the first surface: no ray of reflected light
     rays = {m: [max(0.0, d - base) for d in depth] for m, (depth, _) in curves.items()}
     first = {m: bias[0] for m, (_, bias) in curves.items()}
@@ -144,15 +152,17 @@ def bounces(work: Work) -> Outcome:
             Statement(
                 f"The bias falls with the bounces before the cache is asked ({m})", "project page, bias plot",
                 f"from {number(bias[0])} at {rays[m][0]:.2f} rays to {number(bias[-1])} at {rays[m][-1]:.2f}",
-                bool(bias[-1] < bias[0]), f"{number(bias[-1] / bias[0])} times", REASON_BIAS,
+                bool(bias[-1] < bias[0]),
+                f"{number(bias[-1] / bias[0])} times" if bias[-1] > 0 else "to below what the samples resolve",
+                REASON_BIAS,
             )
             for m, (_, bias) in curves.items()
         ),
     ]  # fmt: skip
-    table = [["", "c", "rays of reflected light", "squared bias"]]
+    table = [["", "keys", "rays of reflected light", "squared bias"]]
     for m, (_, bias) in curves.items():
-        table += [[m, number(c), f"{r:.2f}", number(b)]
-                  for c, r, b in zip(settings.thresholds, rays[m], bias, strict=True)]  # fmt: skip
+        values = [", ".join(f"{k}={v}" for k, v in keys.items()) for keys in settings.stops()[m][1]]
+        table += [[m, v, f"{r:.2f}", number(b)] for v, r, b in zip(values, rays[m], bias, strict=True)]
     lines = {m: (rays[m], np.maximum(bias, 1e-6)) for m, (_, bias) in curves.items()}
     return Outcome(
         statements, {"Bias": table},
@@ -167,17 +177,18 @@ def bounces(work: Work) -> Outcome:
 REASON_BIAS = (
     "c makes nirc gather what is near, and far light stays with the cache. The cache blurs near and far directions "
     "into one another, and these errors cancel in the integral over directions; where the near part alone is replaced, "
-    "the far part's error is left. The paper's heuristic (termination=balanced) follows directions by chance"
+    "the far part's error is left. With the paper's heuristic (termination=balanced), which follows directions by "
+    "chance, the bias falls"
 )
 
 
-def _stops(group, loaded, settings: Bounces, plugin: str, bar) -> Part:
+def _stops(group, loaded, settings: Bounces, plugin: str, keys: list[dict], bar) -> Part:
     common = {"channels": "depth", "train_steps": 0}
     trained = measures.make(loaded, plugin, **common)
     measures.train(loaded, trained, settings.train)
     images, depths = [], []
-    for k, c in enumerate(settings.thresholds):
-        integrator = measures.frozen(trained, loaded, group.folder, plugin, spread_threshold=c, **common)
+    for k, of in enumerate(keys):
+        integrator = measures.frozen(trained, loaded, group.folder, plugin, **of, **common)
         integrator.plan_samples(1)  # so that what depends on the sample count stays at its most biased setting
         size, *more = budget.plan_passes(loaded.scene, settings.spp)
         pair, depth = [], []
@@ -190,7 +201,7 @@ def _stops(group, loaded, settings: Bounces, plugin: str, bar) -> Part:
         images.append(np.stack(pair))
         depths.append(float(np.mean(depth)))
         if bar:
-            bar(k + 1, len(settings.thresholds))
+            bar(k + 1, len(keys))
     return Part({"depth": depths}, {"images": np.stack(images).astype(np.float32)})
 
 
