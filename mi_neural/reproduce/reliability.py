@@ -272,6 +272,16 @@ def crops(work: Work, quick: Settings, full: Settings, change: Change) -> Outcom
                 steady["blend"] < 1.1 * steady["EMA"], _percent(steady["blend"], steady["EMA"]), REASON_CROP,
             )
         )  # fmt: skip
+    area = {m: float(np.sum(c["flip"][CHANGE:])) for m, c in found.curves.items()}
+    best = min(area["High-LR"], area["EMA"])
+    statements.append(
+        Statement(
+            "The blend adapts as quickly as High-LR and recovers the stability of EMA", "figure 1",
+            "sum of FLIP over all frames from the change on, whole picture: "
+            + ", ".join(f"{m} {number(v)}" for m, v in area.items()),
+            bool(area["blend"] < 1.05 * best), f"{_percent(area['blend'], best)} against the better of both", REASON_CROP,
+        )
+    )  # fmt: skip
     return Outcome(statements, {"Means over frames": table}, _crop_pictures(found), [*NOTES, f"Here {change.what}."])
 
 
