@@ -49,7 +49,7 @@ NOTES = [
     "The paper's scenes (Sponza, Bistro, San Miguel) are not shipped; the scene here is one of the package's own, and "
     f"its light changes at frame {CHANGE}, as in the paper.",
     "Direct light of each frame is replaced by its mean over many samples before errors are measured: its noise is "
-    "the same for all methods and larger than what they differ in.",
+    "the same for all methods and says nothing of the cache. Figure 4 has the figures with that noise, too.",
     "The paper prints neither network nor learning rate. Here they are the defaults of nirc; λ = 0.9, K = 128 and "
     "κ = 4 are the paper's. High-LR and EMA are nirc with blend=fast and blend=ema, last_rate=1; the blend is "
     "blend=reliability, reliability=correlation; by evidence is the default rule of this package.",
@@ -279,7 +279,8 @@ def crops(work: Work, quick: Settings, full: Settings, change: Change) -> Outcom
             "The blend adapts as quickly as High-LR and recovers the stability of EMA", "figure 1",
             "sum of FLIP over all frames from the change on, whole picture: "
             + ", ".join(f"{m} {number(v)}" for m, v in area.items()),
-            bool(area["blend"] < 1.05 * best), f"{_percent(area['blend'], best)} against the better of both", REASON_CROP,
+            bool(area["blend"] < 1.05 * best), f"{_percent(area['blend'], best)} against the better of both",
+            REASON_CROP,
         )
     )  # fmt: skip
     return Outcome(statements, {"Means over frames": table}, _crop_pictures(found), [*NOTES, f"Here {change.what}."])
