@@ -362,7 +362,7 @@ ENTRIES = (
     Entry("nirc/cost", "Performance comparison", "What a sample of the incident cache costs beside a path and nrc.",
           "glossy_hall", (20, 300), cost),
     Entry("nirc/bias", "Bias over indirect bounces", "How many rays the incident cache saves at equal bias.",
-          "cornell_box", (20, 1200), bounces),
+          "cornell_box", (30, 1200), bounces),
     Entry("nirc/hemisphere", "NIRC visualization", "Light from all directions at a point: predicted and traced.",
           "cornell_box", (10, 300), hemisphere),
     Entry("nirc/two_level", "Two-Level Monte Carlo", "Noise and time of the unbiased estimator against path tracing.",
