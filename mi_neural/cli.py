@@ -15,6 +15,7 @@ from mi_neural.commands.doc import doc
 from mi_neural.commands.info import info
 from mi_neural.commands.plan import plan
 from mi_neural.commands.render import render
+from mi_neural.commands.reproduce import reproduce
 from mi_neural.commands.scenes import scenes
 from mi_neural.commands.sequence import sequence
 
@@ -28,6 +29,7 @@ app = typer.Typer(
 app.command()(render)
 app.command()(compare)
 app.command()(sequence)
+app.command()(reproduce)
 app.command()(plan)
 app.add_typer(scenes)
 app.command()(info)

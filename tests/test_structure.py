@@ -29,7 +29,7 @@ LAYERS = [
     {"integrators"},
     {"bench"},
     {"explore"},
-    {"manual"},
+    {"manual", "reproduce"},
     {"commands"},
     {"cli"},
     {"__main__"},
