@@ -39,12 +39,12 @@ def test_true_error_lies_in_the_interval_as_often_as_it_says(n, tail):
     assert inside / 300 >= least and abs(np.mean(ratios) - 1) < 0.03
 
 
-def test_groups_are_merged_and_few_passes_say_nothing(rng):
+def test_passes_are_kept_in_few_groups_and_few_passes_say_nothing(rng):
     film = Groups()
     for k, image in enumerate(passes(rng, 100, 1, 1.0, 8)[1]):
         film.add(image, 1 + k % 3)
         assert (film.error() is None) == (k < 3)
-    assert len(film.groups) < 2 * Groups.MOST
+    assert len(film.groups) == Groups.MOST and max(n for _, n in film.groups) <= 3 + min(n for _, n in film.groups)
     assert sum(n for _, n in film.groups) == film.spp
     total = sum(image * n for image, n in film.groups) / film.spp
     np.testing.assert_allclose(total, film.mean(), rtol=1e-5)

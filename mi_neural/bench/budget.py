@@ -388,9 +388,8 @@ class _Run:
         start = clock()
         seed = pass_seed(self.seed, STREAM_IMAGE, self.n_passes)
         take = self.film.replace if getattr(self.integrator, "cumulative", False) else self.film.add
-        # Where the spread of the passes is measured, they must be independent
-        sequence = seed if self.film.independent else pass_seed(self.seed, STREAM_IMAGE, self.first)
-        with placed(self.integrator, sequence, 0 if self.film.independent else self.film.spp):
+        number, taken = self.film.sequence() or (self.n_passes - self.first, 0)
+        with placed(self.integrator, pass_seed(self.seed, STREAM_IMAGE, self.first + number), taken):
             take(render_pass(self.scene, self.integrator, spp, seed, self.sensor), spp)
         self.n_passes += 1
         seconds = clock() - start

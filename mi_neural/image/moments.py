@@ -10,12 +10,7 @@ from . import metrics
 
 
 class Accumulator:
-    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted.
-
-    `independent`: whether the passes must be, because their spread is measured.
-    """
-
-    independent = False
+    """Sample-weighted mean of passes. A pixel that is not finite in a pass is left out of that pass and counted."""
 
     def __init__(self) -> None:
         self.total: np.ndarray | None = None
@@ -35,6 +30,11 @@ class Accumulator:
         self.weight += spp * finite
         self.nonfinite += n_bad
         self.spp += spp
+
+    def sequence(self) -> tuple[int, int] | None:
+        """The number of the sequence of stratified random numbers that the next pass goes on with, and how many samples
+        of it there are. None: the pass must be independent of all others."""
+        return 0, self.spp
 
     def replace(self, image: np.ndarray, spp: int) -> None:
         """Add a film that already stands for all passes so far, `spp` more samples a pixel included."""
@@ -64,8 +64,6 @@ class Moments(Accumulator):
     squares   Σ n (pass - mean)², shape (height, width, channels)
     """
 
-    independent = True
-
     def __init__(self) -> None:
         super().__init__()
         self.n_passes: np.ndarray | None = None
@@ -76,6 +74,9 @@ class Moments(Accumulator):
         Accumulator.add(one, image, spp)
         one.n_passes, one.squares = (one.weight > 0).astype(np.float64), np.zeros_like(one.total)
         self.merge(one)
+
+    def sequence(self) -> None:
+        return None
 
     def replace(self, image: np.ndarray, spp: int) -> None:
         raise TypeError("the spread of passes cannot be taken from an image that stands for all of them")
@@ -119,15 +120,16 @@ CONFIDENCE = 0.9
 
 
 class Groups(Accumulator):
-    """Sample-weighted mean of passes, kept in groups of neighbouring passes whose spread says how noisy the mean is.
+    """Sample-weighted mean of passes, kept in groups of passes whose spread says how noisy the mean is.
 
-    With G groups of n_g samples each, N in all, ``Σ n_g (x_g - mean)² / ((G - 1) N)`` is the variance of the mean of a
-    pixel, without bias. Each group's share of the sum over all pixels is one sample of the image's error; their spread
-    gives the interval for the error of this image (Student).
+    A pass goes to the group that has the fewest samples. Groups are independent of each other; the passes of one may
+    go on with the stratified numbers of the one before. With G groups of n_g samples each, N in all,
+    ``Σ n_g (x_g - mean)² / ((G - 1) N)`` is the variance of the mean of a pixel, without bias. Each group's share of
+    the sum over all pixels is one sample of the image's error; their spread gives the interval for the error of this
+    image (Student).
     """
 
-    independent = True
-    #: Most groups; twice as many are merged in pairs.
+    #: Most groups.
     MOST = 8
 
     def __init__(self) -> None:
@@ -137,10 +139,16 @@ class Groups(Accumulator):
     def add(self, image: np.ndarray, spp: int) -> None:
         super().add(image, spp)
         image = np.where(np.isfinite(image).all(axis=-1, keepdims=True), image, 0.0)[..., :3].astype(np.float32)
-        self.groups.append((image, spp))
-        if len(self.groups) >= 2 * self.MOST:
-            pairs = zip(self.groups[::2], self.groups[1::2], strict=True)
-            self.groups = [((a * n + b * m) / (n + m), n + m) for (a, n), (b, m) in pairs]
+        g, n = self.sequence()
+        if n == 0:
+            self.groups.append((image, spp))
+        else:
+            self.groups[g] = (self.groups[g][0] * n + image * spp) / np.float32(n + spp), n + spp
+
+    def sequence(self) -> tuple[int, int]:
+        if len(self.groups) < self.MOST:
+            return len(self.groups), 0
+        return min(((g, n) for g, (_, n) in enumerate(self.groups)), key=lambda group: group[1])
 
     def replace(self, image: np.ndarray, spp: int) -> None:
         raise TypeError("the spread of passes cannot be taken from an image that stands for all of them")
