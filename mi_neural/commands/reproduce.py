@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shlex
 import sys
 from pathlib import Path
@@ -43,6 +44,7 @@ def reproduce(
     terminal.set_variant(variant)
     command = shlex.join(["mi-neural", *sys.argv[1:]])
     for entry in entries:
+        gc.collect()  # scenes and integrators of the entry before, see Group.part
         work = Work(output, quick, wanted)
         terminal.announce(f"{entry.name}: {entry.shows}")
         try:

@@ -7,6 +7,7 @@ of other settings, versions or sizes are never mixed. Entries that need the same
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 from collections.abc import Callable, Mapping
@@ -51,6 +52,9 @@ class Group:
             return Part(numbers, arrays)
         except (OSError, ValueError):
             pass  # not there, or damaged: it is measured
+        # Scenes and integrators of earlier parts refer to each other in circles. As long as they are there, they are
+        # compiled into the kernels of this part, and they could be freed at any moment of it
+        gc.collect()
         found = measure(self.progress(name.replace("_", " ")))
         numbers = json.loads(json.dumps(plain(found.numbers)))
         if found.arrays:
