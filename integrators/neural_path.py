@@ -8,6 +8,7 @@ import mitsuba as mi
 from mi_neural.caches.accuracy import MeasuredCache
 from mi_neural.caches.blend import where_active
 from mi_neural.caches.outgoing import OutgoingShape
+from mi_neural.estimators.spread import grown
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix
@@ -22,8 +23,6 @@ DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
 #: Share of its training paths that run on without self-training. Of a denoised image of 32 samples, FLIP over that with
 #: a quarter: veach-bidir 0.89, veach-ajar, living room and staircase 0.99, Cornell box 1.04 (manual, measured).
 DENOISED_UNBOUNDED = 0.5
-#: Samples a pixel at which the spread threshold has grown to 1.
-FULL = 256
 #: Ratio b²/v from which on the spread threshold of an image that will be denoised is the largest.
 LARGE_RATIO = 0.02
 
@@ -64,7 +63,7 @@ class NeuralPathIntegrator(OutgoingIntegrator):
 
     def settings(self, spp: int) -> tuple:
         """Samples that the noise is averaged over, and the spread threshold."""
-        return float(spp) * (DENOISED_SAMPLES if self.denoised else 1), max(self.spread_threshold, spp / FULL)
+        return float(spp) * (DENOISED_SAMPLES if self.denoised else 1), grown(self.spread_threshold, spp)
 
     # -------------------------------------------------------------------------------------------------------------
 

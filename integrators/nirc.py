@@ -28,8 +28,8 @@ from mi_neural.render.sampling import PathSampler
 
 #: Caches of incident radiance without a network
 CONTROLS = {"spatial_hash": SpatialHashCache, "sh_grid": HarmonicCache}
-#: Constant c of the spread test of paths that stop in the cache, and the samples a pixel from which on it grows.
-WIDE, FULL = 1.0, 256
+#: Constant c of the spread test of paths that stop in the cache.
+WIDE = 1.0
 TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "balanced_shares")
 #: Dimensions of the stratified numbers of cache samples
 EXTRA, EXTRA_LOBE = range(paths.FREE, paths.FREE + 2)
@@ -168,7 +168,7 @@ class NIRCIntegrator(IncidentIntegrator):
         `gather_half` more. Of paths that stop the constant c of the spread test, which grows with the samples, so that
         E tends to that of path tracing."""
         if self.one_path:
-            return (max(self.path_threshold, spp / FULL),)
+            return (spread.grown(self.path_threshold, spp),)
         if self.termination != "adaptive":
             return ({"spread": 1.0}.get(self.termination, 0.0),)
         more = max(spp - 1, 0)

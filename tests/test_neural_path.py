@@ -20,7 +20,8 @@ from mi_neural import scenes
 from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
-from mi_neural.integrators.neural_path import DENOISED_SAMPLES, FULL, denoised_threshold
+from mi_neural.estimators.spread import grown
+from mi_neural.integrators.neural_path import DENOISED_SAMPLES, denoised_threshold
 from mi_neural.render.kernels import on_gpu
 
 SLOW = pytest.mark.slow
@@ -261,7 +262,7 @@ def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
     force(integrator, ratio=0.02)
     ours = renders(box, integrator, 24, 32)
-    c = denoised_threshold(0.02, 32) if denoised else 32 / FULL
+    c = denoised_threshold(0.02, 32) if denoised else grown(0.01, 32)
     assert (c > 5) == denoised
     known = renders(box, outgoing_alone(trained, box, spread_threshold=c), 24, 32, first_seed=1000)
     assert_same_mean(ours, known, f"nrc, c = {c}", relative=1e-5)
@@ -296,7 +297,7 @@ def test_mix_has_less_error_than_either_part():
     trained = auto(train_samples=1024)
     trained.train(box, 200)
     path = np.array(mi.render(box, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
-    parts = [outgoing_alone(trained, box, spread_threshold=c) for c in (0.0, 64 / FULL)]
+    parts = [outgoing_alone(trained, box, spread_threshold=c) for c in (0.0, grown(0.01, 64))]
     lamp = ndimage.maximum_filter(path.max(axis=-1), 3)[..., None] > 1  # its edges are as noisy whatever is traced
     weight = np.where(lamp, 0, 1 / (path.mean(axis=-1, keepdims=True) ** 2 + 1e-2))
 
@@ -328,7 +329,7 @@ def test_denoised_counts_noise_less(trained, box, tmp_path):
         integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels="share, depth")
         found[denoised] = render(box, integrator, 4)[..., 3:].mean(axis=(0, 1))
     n, c = auto(denoised=True).settings(4)
-    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(2 * FULL)[1] == 2.0
+    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(512)[1] == 2.0
     assert auto(denoised=True, spread_threshold=0.1).settings(4)[1] == 0.1
     print(f"(share, depth): {found[False]}, denoised {found[True]}")
     assert found[True][0] < 0.5 * found[False][0] and found[True][1] > found[False][1]

@@ -13,6 +13,8 @@ import mitsuba as mi
 #: A lobe that sends a sample with a density above this (per steradian; a Lambertian one has at most 1/π) is followed:
 #: the directional detail of a cache of incident radiance does not suffice for it.
 SHARP_PDF = 3.0
+#: Samples a pixel at which :func:`grown` begins to grow from 1.
+GROWS_FROM = 256
 
 
 def camera_spread(distance_squared, cos_theta):
@@ -32,6 +34,12 @@ def segment_spread(distance_squared, pdf, cos_theta):
 def exceeds(spread_root, a_0, threshold):
     """``a > c a_0``: the path has become so wide that the detail a cache loses would not be seen."""
     return dr.square(spread_root) > threshold * a_0
+
+
+def grown(threshold: float, spp: float) -> float:
+    """Constant c of the spread test for an image of `spp` samples: at least spp/256. Paths run further the more samples
+    there are, so that the limit is path tracing."""
+    return max(threshold, spp / GROWS_FROM)
 
 
 def balanced_probability(n_cache: int, pdf):
