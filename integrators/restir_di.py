@@ -9,7 +9,7 @@ from mi_neural.estimators import reservoir
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import refuse_gradients
-from mi_neural.integrators.checks import check_film, check_scene, refuse_medium_of, sensor_of
+from mi_neural.integrators.checks import check_film, check_lights_on_gpu, check_scene, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.integrators.restir_past import Past, alike, camera_of, nothing, reproject, slim_surface
@@ -19,7 +19,6 @@ from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import Area, camera_rays, coverage, recordable
 from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, is_recording, undisturbed
-from mi_neural.render.kernels import on_gpu
 from mi_neural.render.sampling import PathSampler
 
 COMBINATIONS = ("unbiased", "biased")
@@ -277,6 +276,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def _lights(self, scene, sensor):
         """See that `state.power` is that of the scene now. Returns what chooses the candidates, and what a recorded
         function takes for granted of it."""
+        check_lights_on_gpu(scene, self.plugin, "take neural_path without a light_sampler")
         s = self.state
         if s.chooser is None:
             s.chooser = self.light_sampler or mi.load_dict(
@@ -288,10 +288,6 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             known = s.power.table.columns if s.power is not None else {}
             same = known and all(np.array_equal(v, known[k]) for k, v in table.columns.items())
             lights = s.power if same else PowerLights(table)
-        mixed = scene.environment() is not None and lights.table.n_emitters > 1
-        # On an H100, Dr.Jit 1.5.0 ended the process: jit_var(r0): unknown variable
-        self._check(not (mixed and on_gpu()), "on a GPU it renders no environment map together with other lights; take "
-                    "nvc_direct, or mi.set_variant('llvm_ad_rgb')")  # fmt: skip
         if s.power is None or s.power.table is not lights.table:
             s.power = lights if isinstance(lights, PowerLights) else PowerLights(lights.table)
         facts = (type(lights).__name__, _facts(lights.table), getattr(lights, "candidates", None))
