@@ -3,7 +3,7 @@
 Each integrator is trained with a number of frames (training steps) or, by ``--paths``, with a number of training paths.
 Its cache or light sampler then stays as it is, and images of each number of samples are rendered. This is repeated with
 other seeds, the same ones for all integrators. DIR/settings.json has a record for each scene, integrator, training and
-number of samples: the mean of the image over that of the reference, minus 1; trimmed relMSE and FLIP of the image and,
+number of samples: the mean of the image over that of the reference; trimmed relMSE and FLIP of the image and,
 with ``--denoise``, of the denoised one; the CPU seconds of the training. All are means over seeds and images;
 ``deviations`` has the standard deviations over the seeds. Integrators without a cache are rendered once.
 
@@ -52,7 +52,7 @@ class Judge:
 
     def errors(self, image: np.ndarray) -> dict[str, float]:
         """The figures of a record."""
-        found = {"mean": float(image.mean() / self.reference.rgb.mean() - 1)} | self._of(image, "")
+        found = {"mean": float(image.mean() / self.reference.rgb.mean())} | self._of(image, "")
         if self.guides is not None:
             found |= self._of(denoise.denoise(image, self.guides)[0], "_denoised")
         return found

@@ -18,7 +18,7 @@ def test_command_compares_settings_after_equal_training(tmp_path, capsys, varian
     assert (path["label"], path["paths"], path["steps"]) == ("path", 0, 0)
     assert [(r["paths"], r["steps"]) for r in (half, whole)] == [(512, 2), (1024, 4)]
     assert whole["train_cpu_seconds"] > half["train_cpu_seconds"] > 0 and whole["deviations"]["relmse"] > 0
-    assert all(abs(r["mean"]) < 1 and r["relmse"] > 0 and "relmse_denoised" not in r for r in records)
+    assert all(0.3 < r["mean"] < 2 and r["relmse"] > 0 and "relmse_denoised" not in r for r in records)
     assert [f.name for f in tmp_path.glob("*.exr")] == ["reference_cornell_box_12x12_16.exr"], "of the scene's depth"
     assert "nrc:train_samples=256" in capsys.readouterr().out
     assert study.main(["nowhere", *arguments[1:]]) == 2 and "no scene file" in capsys.readouterr().err
