@@ -20,7 +20,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from ablation import reference_of
 
 from mi_neural.bench import budget, denoise, environment, load, terminal
 from mi_neural.image import exr, metrics
@@ -118,6 +117,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     import mitsuba as mi
+
+    sys.path.append(str(Path(__file__).resolve().parent))
+    from ablation import reference_of
 
     mi.set_variant(options.variant)
     options.output.mkdir(parents=True, exist_ok=True)
