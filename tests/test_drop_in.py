@@ -137,15 +137,25 @@ def test_crop_window_that_moves_is_no_new_recording():
 # ---------------------------------------------------------------- coverage and what is hidden
 
 
-COVERAGE = {
-    "mask": {"block": {"type": "rectangle", "to_world": T().translate([0, 0, 0.9]).scale(0.6),
-                       "bsdf": {"type": "mask", "opacity": 0.4, "bsdf": grey(0.5)}},
-             "back": None, "left": None, "right": None, "floor": None, "ceiling": None},
-    "null": {"block": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "null"}}, "back": None},
-    "glass": {"block": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"}}, "back": None},
-    "black sky": {"sky": {"type": "constant", "radiance": 0.0}, "back": None},
-    "sky": {"sky": {"type": "constant", "radiance": 0.3}, "back": None},
+#: Side by side, each in a third of the picture: a mask in front of nothing, a boundary that is none, and glass.
+THIRDS = {
+    "mask": {"type": "rectangle", "to_world": T().translate([-2.65, 0, 0.9]).scale(0.6),
+             "bsdf": {"type": "mask", "opacity": 0.4, "bsdf": grey(0.5)}},
+    "null": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "null"}},
+    "glass": {"type": "sphere", "center": [2.65, 0, 0], "radius": 0.5, "bsdf": {"type": "dielectric"}},
 }  # fmt: skip
+WIDE = {
+    "back": None, "left": None, "right": None, "block": None,
+    "floor": wall((1.3, -1, 0), (1, 0, 0), -90, 2.5, bsdf=grey(0.6)),
+    "ceiling": wall((1.3, 1, 0), (1, 0, 0), 90, 2.5, bsdf=grey(0.6)),
+    "lamp": wall((0, 0.98, 0), (1, 0, 0), 90, bsdf=grey(0.0), emitter={"type": "area", "radiance": 2.0}),
+}  # fmt: skip
+#: What is in the scene, and the parts of the picture that are looked at one by one.
+COVERAGE = {
+    "thirds": ({**WIDE, **THIRDS}, 3),
+    "black sky": ({"sky": {"type": "constant", "radiance": 0.0}, "back": None}, 1),
+    "sky": ({"sky": {"type": "constant", "radiance": 0.3}, "back": None}, 1),
+}
 
 
 @pytest.fixture(scope="module")
@@ -165,13 +175,15 @@ def of_path():
 @pytest.mark.parametrize("case", COVERAGE)
 @ALL
 def test_coverage_is_that_of_path(name, case, hide, of_path):
-    scene = room(sensor=camera(film=film(pixel_format="rgba")), **COVERAGE[case])
+    parts, n = COVERAGE[case]
+    scene = room(sensor=camera(film=film(12 * n, pixel_format="rgba"), fov_axis="y"), **parts)
     ours = images(scene, {**INTEGRATORS[name], "hide_emitters": hide}, spp=64)
     path = of_path((case, hide), scene, hide_emitters=hide)
-    agree(name, ours, path)
-    a, b = ours[..., 3].mean(axis=0), path[..., 3].mean(axis=0)
-    # 256 samples of a share of at most 1/4 of variance each: 4.9 standard errors of the difference
-    assert np.abs(a - b).max() < 0.22 and abs(a.mean() - b.mean()) < 0.02
+    for a, b in zip(np.split(ours, n, axis=2), np.split(path, n, axis=2), strict=True):
+        agree(name, a, b)
+        a, b = a[..., 3].mean(axis=0), b[..., 3].mean(axis=0)
+        # 256 samples of a share of at most 1/4 of variance each: 4.9 standard errors of the difference
+        assert np.abs(a - b).max() < 0.22 and abs(a.mean() - b.mean()) < 0.02
 
 
 @pytest.mark.parametrize("name", CACHED)
