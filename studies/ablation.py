@@ -145,10 +145,15 @@ def _begin_anew(integrator, seed: int) -> None:
             part.cache.seed = seed
 
 
-def reference_of(loaded: load.LoadedScene, folder: Path, spp: int, path: str | None, progress=None) -> Reference:
-    """The reference in the file `path`, or the one beside the scene, or one of `spp` samples, kept in `folder`."""
+def reference_of(
+    loaded: load.LoadedScene, folder: Path, spp: int, path: str | None, progress=None, same_depth: bool = False
+) -> Reference:
+    """The reference in the file `path`, or the one beside the scene, or one of `spp` samples, kept in `folder`. With
+    `same_depth`, the one beside the scene counts only if it has the scene's depth."""
     if path := path or references.beside(loaded.path, loaded.size, loaded.box_filter):
-        return references.of_film(path, loaded)
+        found = references.of_film(path, loaded)
+        if not (same_depth and references.depth_warning(found, loaded.carried.get("max_depth"))):
+            return found
     width, height = loaded.size
     path = folder / f"reference_{loaded.name}_{width}x{height}_{spp}.exr"
     if not path.is_file():

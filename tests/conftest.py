@@ -3,7 +3,6 @@
 The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest` runs the same tests on a GPU.
 """
 
-import contextlib
 import gc
 import importlib
 import os
@@ -13,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import quick_kernels  # noqa: F401  (first: it chooses how kernels are compiled)
+import quick_kernels  # (first: it chooses how kernels are compiled)
 
 import mi_neural  # isort: skip  (second: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
@@ -27,11 +26,19 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 VARIANT = os.environ.get("MI_NEURAL_TEST_VARIANT", "llvm_ad_rgb")
 ROOT = Path(__file__).resolve().parents[1]
-TASKS = Path("/proc/self/task")  # the threads of this process
 
 if text := mi_neural.variant_problem(VARIANT):
     raise pytest.UsageError(f"MI_NEURAL_TEST_VARIANT: {text}")
 mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
+#: Begins the code of a fresh interpreter: kernels and threads are as in this process.
+QUICK = f"""import sys
+sys.path.insert(0, {str(ROOT / 'tests')!r})
+import quick_kernels, mitsuba
+def set_variant(*names, before=mitsuba.set_variant):
+    before(*names)
+    quick_kernels.let_others_work()
+mitsuba.set_variant = set_variant
+"""
 gc.disable()  # while test modules are imported: what they define stays
 
 
@@ -52,18 +59,9 @@ def _what_earlier_modules_imported_stays():
     _keep_what_is_there()
 
 
-def _threads_that_wait_let_others_work():
-    """A thread of Dr.Jit that waits for work spins for 20 ms. Where each core has a process of pytest-xdist, that was a
-    quarter of all time. With the lowest priority they spin, and work, where a core is idle."""
-    for task in TASKS.iterdir() if TASKS.is_dir() else ():  # Linux
-        with contextlib.suppress(OSError):  # it has ended meanwhile
-            if (task / "comm").read_text().startswith("nt ["):
-                os.setpriority(os.PRIO_PROCESS, int(task.name), 19)
-
-
 @pytest.fixture(autouse=True)
 def _same_start_for_every_test():
-    _threads_that_wait_let_others_work()  # a test may have started new ones
+    quick_kernels.let_others_work()  # a test may have started new ones
     mi.set_variant(VARIANT)
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 (for libraries that draw from the global state)
@@ -135,7 +133,7 @@ def run_python(tmp_path):
 
     def run(code: str, ok: bool = True, quick: bool = False, **env: str) -> subprocess.CompletedProcess:
         if quick:
-            code = f"import sys; sys.path.insert(0, {str(ROOT / 'tests')!r}); import quick_kernels\n{code}"
+            code = QUICK + code
         base = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
         done = subprocess.run(
             [sys.executable, "-c", code], env=base | env, cwd=tmp_path, capture_output=True, text=True, timeout=300

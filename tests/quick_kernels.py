@@ -11,10 +11,12 @@ a kernel is ready in a third of the time, and runs as fast within what the tests
 Dr.Jit looks up a kernel by its program, not by how it was compiled, so these have a cache of their own.
 """
 
+import contextlib
 import ctypes
 import os
 from pathlib import Path
 
+TASKS = Path("/proc/self/task")  # the threads of this process
 CACHE = Path(__file__).resolve().parents[1] / ".pytest_cache" / "kernels"
 
 optimized = os.environ.get("MI_NEURAL_TEST_OPTIMIZED", "") not in ("", "0")
@@ -34,6 +36,15 @@ def skip_optimisation() -> None:
     parse = ctypes.CDLL(name).LLVMParseCommandLineOptions  # the library Dr.Jit has loaded: one handle per process
     parse.argtypes, parse.restype = [ctypes.c_int, ctypes.POINTER(ctypes.c_char_p), ctypes.c_char_p], None
     parse(len(options), (ctypes.c_char_p * len(options))(*options), None)
+
+
+def let_others_work() -> None:
+    """A thread of Dr.Jit that waits for work spins for 20 ms. Where each core has a process of pytest-xdist, that was a
+    quarter of all time. With the lowest priority they spin, and work, where a core is idle."""
+    for task in TASKS.iterdir() if TASKS.is_dir() else ():  # Linux
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            if (task / "comm").read_text().startswith("nt ["):
+                os.setpriority(os.PRIO_PROCESS, int(task.name), 19)
 
 
 if not optimized:

@@ -460,10 +460,12 @@ def test_another_depth_is_noticed():
 # ---------------------------------------------------------------- rows and reports
 
 
-@pytest.fixture
-def measured(loaded, tmp_path):
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
     """A comparison of `path` with the fake cache: (pictures, reference)."""
-    ref = reference.render_reference(loaded, 64, tmp_path)
+    register()
+    loaded = load.load_scene("cornell_box", SIZE)
+    ref = reference.render_reference(loaded, 64, tmp_path_factory.mktemp("reference"))
     specs = [load.parse_integrator(text) for text in ("path", "fake_cache:fraction=0.25")]
     cases = benchmark.make_cases(loaded, specs, {"max_depth": 4})
     guides = denoise.render_guides(loaded.scene)[0] if has_denoiser() else None

@@ -185,8 +185,13 @@ def test_rollback_brings_back_the_field_that_a_restart_replaced():
 # ---------------------------------------------------------------- integrators
 
 
+#: A network of which a training step takes a third of the time.
+SMALL = {"levels": 4, "hashmap_size": 1024, "width": 16}
+
+
 def nirc(**keys):
-    return mi.load_dict({"type": "nirc", "train_samples": 256, "train_frames": 0, "light_samples": 1, **keys})
+    keys = {"train_samples": 256, "train_frames": 0, "light_samples": 1, **SMALL, **keys}
+    return mi.load_dict({"type": "nirc", **keys})
 
 
 def nrc(**keys):
@@ -228,7 +233,7 @@ def test_blend_follows_a_light_as_quickly_as_fast_and_keeps_still_as_the_average
 def test_channels_show_which_predictor_is_asked(plugin):
     scene, _ = load("point_lit_sphere", 8)
     for mode, value in (("ema", 0), ("fast", 1), ("reliability", 0)):
-        integrator = INTEGRATORS[plugin](blend=mode, channels="sigma, preference")
+        integrator = INTEGRATORS[plugin](blend=mode, channels="sigma, preference", **SMALL)
         integrator.train(scene, 1)
         image = np.array(integrator.render(scene, spp=1))
         assert image.shape[-1] == 5 and (image[..., 3:] == value).all()

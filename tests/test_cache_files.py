@@ -20,6 +20,8 @@ from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape, OutgoingTrai
 from mi_neural.caches.reliability import Reliability
 
 TINY = {"n_levels": 4, "hashmap_size": 2**10, "width": 16}
+#: The same, as keys of integrators.
+SMALL = {"train_samples": 256, "levels": 4, "hashmap_size": 1024, "width": 16}
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +107,7 @@ def test_integrators_that_only_prepared_train_as_those_that_did_not(cube, one_th
     scene, _ = cube
     fields = []
     for prepares in (False, True):
-        nirc = mi.load_dict({"type": "nirc", "train_samples": 256, "levels": 4, "hashmap_size": 1024})
+        nirc = mi.load_dict({"type": "nirc", **SMALL})
         nirc.train(scene, 8)
         if prepares:
             nirc.prepare(scene, spp=2)
@@ -132,8 +134,7 @@ def test_statistics_of_another_reliability_are_left_out(cube, tmp_path):
 
 
 def small_nirc():
-    sizes = {"train_samples": 256, "levels": 4, "hashmap_size": 1024, "width": 16}
-    return mi.load_dict({"type": "nirc", "blend": "reliability", **sizes})
+    return mi.load_dict({"type": "nirc", "blend": "reliability", **SMALL})
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +246,7 @@ def test_header_is_read_as_data(tmp_path):
 
 def test_whole_cache_of_an_integrator_is_written_or_none(cube, tmp_path, monkeypatch):
     scene, _ = cube
-    nirc = mi.load_dict({"type": "nirc", "train_samples": 256, "levels": 4, "hashmap_size": 1024})
+    nirc = mi.load_dict({"type": "nirc", **SMALL})
     nirc.train(scene, 1)
     nirc.save_cache(tmp_path / "a.npz")
     before = (tmp_path / "a.npz").read_bytes()
@@ -262,7 +263,7 @@ def test_whole_cache_of_an_integrator_is_written_or_none(cube, tmp_path, monkeyp
 
 def test_facts_in_the_header_are_those_of_the_integrator(cube, tmp_path):
     scene, _ = cube
-    nrc = mi.load_dict({"type": "nrc", "train_samples": 256, "levels": 4, "hashmap_size": 1024})
+    nrc = mi.load_dict({"type": "nrc", **SMALL})
     with dr.suspend_grad():
         nrc.train(scene, 2)
     nrc.save_cache(tmp_path / "a.npz")

@@ -29,30 +29,45 @@ N_TESTS = len(NAMES) * (len(SCENES) + len(LIMITS)) + 1
 TRACED = {"spread_threshold": float("inf"), "max_depth": 8}
 
 
-def compare(what: str, scene, reference: str, keys: dict, **depth) -> None:
-    known = renders(scene, {"type": reference, **depth}, 16, 128, first_seed=500)
-    ours = renders(scene, keys | depth, 16, 128)
-    assert_same_mean(ours, known, what, blocks=2, relative=1e-4, tests=N_TESTS)
+@pytest.fixture(scope="module")
+def known():
+    """`known(what, scene, integrator)`: images of the reference, rendered once."""
+    found = {}
+
+    def images(what, scene, integrator: dict) -> np.ndarray:
+        if what not in found:
+            found[what] = renders(scene, integrator, 16, 128, first_seed=500)
+        return found[what]
+
+    return images
+
+
+def compare(what: str, scene, reference: np.ndarray, keys: dict) -> None:
+    assert_same_mean(renders(scene, keys, 16, 128), reference, what, blocks=2, relative=1e-4, tests=N_TESTS)
 
 
 @pytest.mark.parametrize("kind", NAMES)
 @pytest.mark.parametrize("name", SCENES)
-def test_paths_without_end_show_the_image_of_volpath(name, kind):
+def test_paths_without_end_show_the_image_of_volpath(name, kind, known):
     make, reference = SCENES[name]
-    compare(f"{name}, {kind}", make(), reference, {"type": kind, **TRACED}, max_depth=8)
+    scene = make()
+    images = known(name, scene, {"type": reference, "max_depth": 8})
+    compare(f"{name}, {kind}", scene, images, {"type": kind, **TRACED})
 
 
-def test_lights_are_chosen_by_a_light_sampler():
-    sampler = {"type": "nvc_lights", "train_frames": 8, "train_samples": 256}
-    compare("nvc", everywhere(fog(0.4)), "volpath", {"type": "nrc", "light_sampler": sampler, **TRACED}, max_depth=8)
+def test_lights_are_chosen_by_a_light_sampler(known):
+    scene, sampler = everywhere(fog(0.4)), {"type": "nvc_lights", "train_frames": 8, "train_samples": 256}
+    images = known("nvc", scene, {"type": "volpath", "max_depth": 8})
+    compare("nvc", scene, images, {"type": "nrc", "light_sampler": sampler, **TRACED})
 
 
 @pytest.mark.parametrize("kind", NAMES)
 @pytest.mark.parametrize("limits", LIMITS)
-def test_depths_roulette_and_hidden_emitters_are_those_of_volpath(limits, kind):
+def test_depths_roulette_and_hidden_emitters_are_those_of_volpath(limits, kind, known):
     scene = room(box=cube(fog(1.5, 0.9)), seen=lamp((0, 0.2, -0.8), rgb(1.0, 2.0, 3.0), 0.2),
                  sky={"type": "constant", "radiance": 0.2})  # fmt: skip
-    compare(f"{limits}, {kind}", scene, "volpath", {"type": kind, **TRACED}, **limits)
+    compare(f"{limits}, {kind}", scene, known(str(limits), scene, {"type": "volpath", **limits}),
+            {"type": kind, **TRACED, **limits})  # fmt: skip
 
 
 # ---------------------------------------------------------------- what is learned
@@ -186,9 +201,8 @@ def test_cloud_seen_in_the_cache(kind, albedo):
     integrator = mi.load_dict({"type": kind, "spread_threshold": 0.0, "train_frames": 96, "train_steps": 0,
                                "train_samples": 1024, "channels": "cache, cached, traced"})  # fmt: skip
     images = np.array([mi.render(scene, integrator=integrator, spp=64, seed=k) for k in range(2)], np.float64)
-    known = renders(scene, {"type": "volpath"}, 4, 256)
     middle = np.s_[:, 3:5, 3:5]
-    expected = 1.0 if albedo == 1 else known[middle].mean()
+    expected = 1.0 if albedo == 1 else renders(scene, {"type": "volpath"}, 4, 256)[middle].mean()
     assert abs(images[middle][..., :3].mean() / expected - 1) < 0.05
     assert integrator.statistics()["nonfinite"] == 0
     cached = images[..., 6:9] if kind == "nrc" else images[..., 3:6]

@@ -104,14 +104,16 @@ def test_denoised_images_are_nearer_to_the_truth_than_with_the_guides_of_aov():
     """Fixed seeds. Of five seeds the ratio was 0.80 to 0.83 at 128x72, and 0.98 to 1.07 in a scene without mirrors."""
     scene = mi.load_file(str(scenes.path("glossy_hall")), resx=96, resy=54)
     path = mi.load_dict({"type": "path", "max_depth": 8})
-    exact = np.array(mi.render(scene, integrator=path, spp=512, seed=1))
+    passes = np.array([mi.render(scene, integrator=path, spp=32, seed=10 + k) for k in range(8)])
+    exact, variance = passes.mean(axis=0), passes.var(axis=0, ddof=1) / len(passes)
     noisy = mi.render(scene, integrator=path, spp=16, seed=2)
     clean = mi_neural.denoise(noisy, scene)
     assert isinstance(clean, mi.TensorXf) and clean.shape == noisy.shape
     aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
     guides = np.array(mi.render(scene, integrator=aov, spp=16, seed=3))[..., -6:]
     before = oidn.denoise(np.array(noisy), guides[..., :3].clip(0, 1).copy(), guides[..., 3:].clip(-1, 1).copy())
-    error = [metrics.relmse_trimmed(image, exact) for image in (np.array(clean), before, np.array(noisy))]
+    error = [metrics.relmse_trimmed(i, exact, variance) for i in (np.array(clean), before, np.array(noisy))]
+    print(f"errors {error}")
     assert error[0] < 0.9 * error[1] and error[1] < 0.5 * error[2]
 
 

@@ -137,28 +137,53 @@ def test_crop_window_that_moves_is_no_new_recording():
 # ---------------------------------------------------------------- coverage and what is hidden
 
 
-COVERAGE = {
-    "mask": {"block": {"type": "rectangle", "to_world": T().translate([0, 0, 0.9]).scale(0.6),
-                       "bsdf": {"type": "mask", "opacity": 0.4, "bsdf": grey(0.5)}},
-             "back": None, "left": None, "right": None, "floor": None, "ceiling": None},
-    "null": {"block": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "null"}}, "back": None},
-    "glass": {"block": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"}}, "back": None},
-    "black sky": {"sky": {"type": "constant", "radiance": 0.0}, "back": None},
-    "sky": {"sky": {"type": "constant", "radiance": 0.3}, "back": None},
+#: Side by side, each in a third of the picture: a mask in front of nothing, a boundary that is none, and glass.
+THIRDS = {
+    "mask": {"type": "rectangle", "to_world": T().translate([-2.65, 0, 0.9]).scale(0.6),
+             "bsdf": {"type": "mask", "opacity": 0.4, "bsdf": grey(0.5)}},
+    "null": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "null"}},
+    "glass": {"type": "sphere", "center": [2.65, 0, 0], "radius": 0.5, "bsdf": {"type": "dielectric"}},
 }  # fmt: skip
+WIDE = {
+    "back": None, "left": None, "right": None, "block": None,
+    "floor": wall((1.3, -1, 0), (1, 0, 0), -90, 2.5, bsdf=grey(0.6)),
+    "ceiling": wall((1.3, 1, 0), (1, 0, 0), 90, 2.5, bsdf=grey(0.6)),
+    "lamp": wall((0, 0.98, 0), (1, 0, 0), 90, bsdf=grey(0.0), emitter={"type": "area", "radiance": 2.0}),
+}  # fmt: skip
+#: What is in the scene, and the parts of the picture that are looked at one by one.
+COVERAGE = {
+    "thirds": ({**WIDE, **THIRDS}, 3),
+    "black sky": ({"sky": {"type": "constant", "radiance": 0.0}, "back": None}, 1),
+    "sky": ({"sky": {"type": "constant", "radiance": 0.3}, "back": None}, 1),
+}
+
+
+@pytest.fixture(scope="module")
+def of_path():
+    """`of_path(what, scene, ...)`: images by ``path``, rendered once."""
+    found = {}
+
+    def rendered(what, scene, **keys):
+        if what not in found:
+            found[what] = images(scene, {"type": "path", **keys}, spp=64, first=100)
+        return found[what]
+
+    return rendered
 
 
 @pytest.mark.parametrize("hide", [False, True])
 @pytest.mark.parametrize("case", COVERAGE)
 @ALL
-def test_coverage_is_that_of_path(name, case, hide):
-    scene = room(sensor=camera(film=film(pixel_format="rgba")), **COVERAGE[case])
+def test_coverage_is_that_of_path(name, case, hide, of_path):
+    parts, n = COVERAGE[case]
+    scene = room(sensor=camera(film=film(12 * n, pixel_format="rgba"), fov_axis="y"), **parts)
     ours = images(scene, {**INTEGRATORS[name], "hide_emitters": hide}, spp=64)
-    path = images(scene, {"type": "path", "hide_emitters": hide}, spp=64, first=100)
-    agree(name, ours, path)
-    a, b = ours[..., 3].mean(axis=0), path[..., 3].mean(axis=0)
-    # 256 samples of a share of at most 1/4 of variance each: 4.9 standard errors of the difference
-    assert np.abs(a - b).max() < 0.22 and abs(a.mean() - b.mean()) < 0.02
+    path = of_path((case, hide), scene, hide_emitters=hide)
+    for a, b in zip(np.split(ours, n, axis=2), np.split(path, n, axis=2), strict=True):
+        agree(name, a, b)
+        a, b = a[..., 3].mean(axis=0), b[..., 3].mean(axis=0)
+        # 256 samples of a share of at most 1/4 of variance each: 4.9 standard errors of the difference
+        assert np.abs(a - b).max() < 0.22 and abs(a.mean() - b.mean()) < 0.02
 
 
 @pytest.mark.parametrize("name", CACHED)
@@ -202,7 +227,8 @@ def test_wrappers_train_for_the_sensor_that_renders(name):
     ours = images(scene, wrapped, 1, 64, 2)[..., :3]
     print(f"{ours.mean() / path.mean() - 1:+.2%}")
     assert abs(ours.mean() / path.mean() - 1) < 0.06
-    loose = images(scene, {"type": "moment", "inner": INTEGRATORS[name]}, mi.load_dict(camera((8, 0, 0.9), (8, 0, -1))))
+    view = mi.load_dict(camera((8, 0, 0.9), (8, 0, -1)))
+    loose = images(scene, {"type": "moment", "inner": INTEGRATORS[name]}, view, spp=4, n=2)
     assert np.isfinite(loose).all()
 
 
@@ -233,12 +259,18 @@ def test_light_sampler_inside_a_function_of_the_users_own_says_why_not(run_pytho
     code = f"""
 import mi_neural, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
-from mi_neural import scenes
-scene = mi.load_file(str(scenes.path("lamp_bays")), resx=8, resy=8)
+lamps = {{name: {{"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([x, 0, 2]).rotate([1, 0, 0], 180),
+                 "emitter": {{"type": "area"}}}} for name, x in (("a", -2), ("b", 2))}}
+film = {{"type": "hdrfilm", "width": 8, "height": 8}}
+scene = mi.load_dict({{"type": "scene", "floor": {{"type": "rectangle"}}, **lamps,
+                      "sensor": {{"type": "perspective", "film": film,
+                                 "to_world": mi.ScalarTransform4f().look_at([0, -3, 2], [0, 0, 0], [0, 0, 1])}}}})
+small = {{"train_frames": 1, "train_samples": 64}}
 for sampler in {samplers}:
     for integrator in {integrators}:
-        keys = {{"train_steps": 0, "train_frames": 1, "train_samples": 64}} if integrator == "nirc" else {{}}
-        it = mi.load_dict({{"type": integrator, "light_sampler": {{"type": sampler}}, **keys}})
+        keys = {{**small, "levels": 2, "width": 8, "train_steps": 0}} if integrator == "nirc" else {{}}
+        nested = {{"type": sampler, **(small if sampler == "nvc_lights" else {{}})}}
+        it = mi.load_dict({{"type": integrator, "light_sampler": nested, **keys}})
         print(sampler, integrator, end=": ", flush=True)
         mi.render(scene, integrator=it, spp=1)
         frame = dr.freeze(lambda scene, it, seed: mi.render(scene, integrator=it, spp=1, seed=seed))
@@ -331,7 +363,7 @@ def test_same_seed_gives_the_same_image_in_another_process(run_python):
         from mi_neural import scenes
         scene = mi.load_file(str(scenes.path("cornell_box")), resx=8, resy=8)
         for keys in ({"type": "nrc"}, {"type": "nirc"}, {"type": "nirc_two_level", "cache_samples": 4}):
-            integrator = mi.load_dict({**keys, "train_frames": 4, "train_samples": 128})
+            integrator = mi.load_dict({**keys, "levels": 4, "width": 16, "train_frames": 4, "train_samples": 128})
             print(*np.array(mi.render(scene, integrator=integrator, spp=4, seed=3)).ravel())
     """
     a, b = (np.array(run_python(code, quick=True).stdout.split(), float) for _ in range(2))

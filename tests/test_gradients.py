@@ -138,7 +138,7 @@ def test_gradients_of_what_is_black():
             if which is not None:
                 params[keys[which]] = at
                 params.update()
-            images[which] = float(np.mean(np.array(mi.render(scene, integrator=path, spp=4096, seed=3))))
+            images[which] = float(np.mean(np.array(mi.render(scene, integrator=path, spp=1024, seed=3))))
             if which is not None:
                 params[keys[which]] = known
                 params.update()

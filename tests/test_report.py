@@ -2,6 +2,7 @@
 
 import base64
 import io
+import re
 
 import numpy as np
 from PIL import Image
@@ -25,6 +26,20 @@ def test_a_scene_opens_with_pictures_and_error_over_time_and_marks_the_best():
     marked = {(line, head[column]) for line, column in report.best(scene.groups)}
     assert marked == {(1, "spp"), (2, "spp"), (3, "relMSE trimmed"), (2, "relMSE trimmed"), (1, "FLIP"), (4, "FLIP")}
     assert text.count('<td class="best">') == len(marked)
+
+
+def test_several_scenes_open_with_the_first_and_end_with_a_summary():
+    scenes = []
+    for name in "ab":
+        rows = [row(label=label, scene=name, budget_seconds=1.0, seconds_total=1.0, relmse_trimmed=0.1, flip=0.1, spp=9)
+                for label in ("path", "nirc")]  # fmt: skip
+        entries = [{"name": "reference", "caption": "", "image": "", "error": None}]
+        scenes.append(report.SceneResult(name, (4, 4), rows, repeats.group(rows), None, [], entries))
+    text = page.page(report.Report("", {}, scenes), {})
+    order = [text.index(part) for part in ("<nav>", 'id="viewer-0"', 'id="viewer-1"', 'id="summary"', 'id="made"')]
+    assert order == sorted(order)
+    links = re.findall(r'<a href="#(.*?)"', text)
+    assert links == ["scene-0", "scene-1", "summary", "made"] and all(f'id="{at}"' in text for at in links)
 
 
 def test_best_of_a_summary_is_the_least_error_and_the_largest_factor():

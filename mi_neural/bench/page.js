@@ -59,7 +59,7 @@ class Viewer {
     const label = this.controls.appendChild(document.createElement("label"));
     label.append("size ");
     const range = label.appendChild(document.createElement("input"));
-    Object.assign(range, { type: "range", min: 160, max: 960, step: 20, value: 340 });
+    Object.assign(range, { type: "range", min: 160, max: 960, step: 20, value: 320 });
     const set = () => this.root.style.setProperty("--width", range.value + "px");
     range.addEventListener("input", set);
     set();

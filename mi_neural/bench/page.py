@@ -154,11 +154,12 @@ def page(report: Report, drawn: dict[tuple[str, str], str]) -> str:
     """The report as one HTML document; `drawn` holds the curves by scene and kind."""
     several = len(report.scenes) > 1
     title = "Speed against error" if several else f"{report.scenes[0].name}: speed against error"
-    contents = [("summary", "Summary")] if several else []
-    contents += [(f"scene-{k}", scene.name) for k, scene in enumerate(report.scenes)]
-    sections = [_summary(report)] if several else []
+    contents = [(f"scene-{k}", scene.name) for k, scene in enumerate(report.scenes)]
+    contents += [("summary", "All scenes")] if several else []
+    sections = []
     for k, scene in enumerate(report.scenes):
         sections.append(_scene(scene, k, {kind: svg for (name, kind), svg in drawn.items() if name == scene.name}))
+    sections += [_summary(report)] if several else []
     environment = "\n".join(f"{k:16} {v}" for k, v in report.environment.items())
     pictures = json.dumps([{"size": s.size, "pictures": s.entries} for s in report.scenes]).replace("</", "<\\/")
     links = "".join(f'<a href="#{at}">{html.escape(text)}</a>' for at, text in [*contents, ("made", "How it was made")])
@@ -189,14 +190,14 @@ def _wide(cells: list[list[str]], marked: set[tuple[int, int]] = frozenset()) ->
 
 def _summary(report: Report) -> str:
     parts = [
-        '<section id="summary"><h2>Summary</h2>',
+        '<section id="summary"><h2>All scenes</h2>',
         "<p>Trimmed relMSE / FLIP. The factor is the trimmed relMSE of the first integrator, denoised or not as in "
         "this line, over that of this line (geometric mean over the scenes). The least error of a column is "
-        "marked.</p>",
+        'marked.</p><div class="tables">',
     ]
     for title, cells in summary(report):
-        parts.append(f"<h3>{html.escape(title)}</h3>{_wide(cells, best_of_summary(cells))}")
-    return "\n".join(parts) + "</section>"
+        parts.append(f"<div><h3>{html.escape(title)}</h3>{_wide(cells, best_of_summary(cells))}</div>")
+    return "\n".join(parts) + "</div></section>"
 
 
 def _scene(scene: SceneResult, k: int, drawn: dict[str, str]) -> str:
