@@ -200,10 +200,15 @@ class VisibleLights:
             weights.append(w * dr.fmax(visible[k], min(CELL_FLOOR, self.floor) if g.cell[k] else self.floor))
         return weights
 
-    def remembering(self, si, n, transmits) -> VisibleLights:
-        """The same choice at the same surface, again and again: the network is queried once."""
+    def remembering(self, si, n, transmits, several: bool = False) -> VisibleLights:
+        """The same choice at the same surface, again and again: the network is queried once.
+
+        With `several` light samples their mean is taken, so that less is gained by a good choice of each: half of the
+        candidates do (Sponza with 1,024 lamps, four light samples: 0.83 of the time for the same error)."""
         lights, weights = copy.copy(self), self.weights(si.p, n, transmits)
         lights.weights = lambda *_: weights
+        if several:
+            lights.n_candidates = (self.n_candidates + 1) // 2
         return lights
 
     def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:

@@ -268,7 +268,7 @@ def several_lights(
     here = Surface(path, bsdf, found)
     hit = _light_hit(scene, lights, here, found)
     if hasattr(lights, "remembering"):
-        lights = lights.remembering(here.it, *here.received)
+        lights = lights.remembering(here.it, *here.received, several=True)
     active = path.active & here.is_smooth()
 
     def one(i, total, sampler):
