@@ -96,7 +96,7 @@ def test_quick_counterpart_shows_both_numbers(tmp_path, monkeypatch):
     tiny = reliability.Settings((16, 16), frames=23, pretrain=2, spp=1, reference_spp=16, cache_samples=1,
                                 methods=("High-LR", "EMA", "blend"))  # fmt: skip
     monkeypatch.setattr(reliability, "QUICK", tiny)
-    for name in ("fig1", "fig4"):
+    for name in ("fig1", "hidden", "fig4"):
         shown = run(f"reliability/{name}", "--quick", "-o", str(tmp_path))
         assert shown.exit_code == 0, shown.stderr
         folder = tmp_path / "reliability" / name
