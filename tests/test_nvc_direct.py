@@ -127,8 +127,9 @@ def many_lights():
 
 @pytest.mark.parametrize("keys", [
     {"light_sampler": nvc()}, {"light_sampler": nvc(freeze=True), "light_samples": 2},
-    {"light_sampler": nvc(outputs=2), "light_samples": 1}, {"light_sampler": {"type": "tree_lights"}},
-], ids=["trained", "untrained, two shadow rays", "clusters, one shadow ray", "tree_lights"])  # fmt: skip
+    {"light_sampler": nvc(outputs=2)}, {"light_sampler": nvc(outputs=2), "light_samples": 1},
+    {"light_sampler": {"type": "tree_lights"}},
+], ids=["trained", "untrained, two shadow rays", "clusters", "clusters, one shadow ray", "tree_lights"])  # fmt: skip
 def test_sampled_has_the_mean_of_path(many_lights, keys):
     scene, path = many_lights
     assert_same_mean(renders(scene, direct(max_depth=2, **keys), 16, 32), path, str(keys), relative=1e-5)
