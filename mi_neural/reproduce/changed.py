@@ -31,6 +31,8 @@ METHODS = {
 }
 #: The network's share of light alone: no gathered light where surfaces are near.
 COMMON = {"termination": "primary", "spread_threshold": 0.0, "channels": "direct,sigma"}
+#: As `nirc` renders by default: what lies near the first surface is traced, and the cache is asked beyond it.
+GATHERED = {"channels": "direct,sigma"}
 
 
 @dataclass(frozen=True)
@@ -133,14 +135,16 @@ def clean(image: exr.Image, direct: np.ndarray) -> np.ndarray:
     return image.rgb - image.layer("direct") + direct
 
 
-def measure(work: Work, settings: Settings, change: Change) -> Measured:
-    """All methods over the frames of one scene; goes on where an earlier call was interrupted."""
-    group = work.group(f"change-{change.scene}", asdict(settings) | {"scene": change.scene, "change": change.what})
+def measure(work: Work, settings: Settings, change: Change, common: dict[str, object] = COMMON) -> Measured:
+    """All methods over the frames of one scene; goes on where an earlier call was interrupted. `common`: keys of all
+    methods."""
+    facts = asdict(settings) | {"scene": change.scene, "change": change.what}
+    group = work.group(f"change-{change.scene}", facts if common == COMMON else facts | {"common": common})
     loaded = load.load_scene(change.scene, settings.size, merge=False)
     over_time = sequence.Sequence(loaded.scene, change.functions, settings.frames, CHANGE)
     plan = sequence.Plan(settings.spp, settings.pretrain)
     run = Watched(loaded, over_time, plan, group.folder / "frames", settings.reference_spp, progress=work.progress)
-    keys = {**COMMON, "cache_samples": settings.cache_samples}
+    keys = {**common, "cache_samples": settings.cache_samples}
     specs = [IntegratorSpec("nirc", {**keys, **METHODS[m]}) for m in settings.methods]
     results = dict(zip(settings.methods, run.run(benchmark.make_cases(loaded, specs)), strict=True))
     direct = [direct_light(group, loaded, over_time, settings, frame) for frame in (0, CHANGE)]

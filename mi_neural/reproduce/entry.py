@@ -71,7 +71,7 @@ class Entry:
     name     SOURCE/NAME, with a key of :data:`SOURCES`
     figure   what it is the counterpart of, as "Figure 4"
     shows    one sentence
-    scene    names of shipped scenes
+    scene    names of shipped scenes; or that the entry makes it, by :mod:`.scene_files`
     seconds  what it takes on two cores with nothing else running: with --quick, as measured (CPU seconds over two), and
              without, as estimated from that
     measure  does the work and gives the outcome; what it has finished is kept, see :class:`.work.Work`

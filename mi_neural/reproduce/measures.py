@@ -82,12 +82,13 @@ def relative_variance(images: list[np.ndarray], spp: int) -> float:
     return float(values[: max(1, int(values.size * (1 - TRIM_FRACTION)))].mean())
 
 
-def direct_reference(group, loaded: LoadedScene, spp: int) -> np.ndarray:
-    """Direct light alone, by a light tree, of `spp` samples a pixel, shape (height, width, 3); kept in the group."""
+def direct_reference(group, loaded: LoadedScene, spp: int, **more) -> np.ndarray:
+    """Direct light alone, by a light tree, of `spp` samples a pixel, shape (height, width, 3); kept in the group.
+    `more`: keys of the integrator."""
 
     def image(bar) -> Part:
         # The type of a light sampler cannot be nested in keywords: dots in names
-        keys = {"max_depth": 2, "light_sampler.type": "tree_lights"}
+        keys = {"max_depth": 2, "light_sampler.type": "tree_lights", **more}
         return Part({}, {"image": render(loaded, make(loaded, "plain_path", **keys), spp, 12345, bar).rgb})
 
     return group.part("reference", image).arrays["image"]

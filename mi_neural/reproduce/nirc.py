@@ -307,7 +307,7 @@ def two_level(work: Work) -> Outcome:
     table = [["scene", "", "variance of a sample", "over path", "time over path", "efficiency"]]
     statements, pictures = [], {}
     for scene in settings.scenes:
-        part = group.part(f"variance_{scene}", lambda bar, s=scene: _variance(settings, s, bar))
+        part = group.part(f"variance_{scene}", lambda bar, s=scene: variance(settings, s, bar))
         rows = part.numbers
         for label, row in rows.items():
             v, t = row["variance"] / rows["path"]["variance"], row["seconds"] / rows["path"]["seconds"]
@@ -339,7 +339,8 @@ def two_level(work: Work) -> Outcome:
 PAPER_TWO = "nirc_two_level, paper"
 
 
-def _variance(settings: TwoLevel, scene: str, bar) -> Part:
+def variance(settings: TwoLevel, scene: str, bar) -> Part:
+    """Variance and seconds of a sample by `path` and by the two-level estimators in a scene, and an image of each."""
     loaded = load.load_scene(scene, settings.size)
     integrators = {"path": measures.make(loaded, "path")}
     for label, keys in ((PAPER_TWO, PAPER), ("nirc_two_level", {})):

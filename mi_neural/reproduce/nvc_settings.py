@@ -166,7 +166,7 @@ def figure_7(work: Work) -> Outcome:
     reference = measures.direct_reference(group, loaded, settings.reference_spp)
     kinds = {"ReSTIR": {}, "with NVC, paper": {"candidate_shadow_ray": False},
              "with NVC, shadow ray": {"candidate_shadow_ray": True}}  # fmt: skip
-    parts = {m: group.part(f"frames_{k}", lambda bar, m=m: _disoccluded(loaded, settings, kinds[m], m != "ReSTIR", bar))
+    parts = {m: group.part(f"frames_{k}", lambda bar, m=m: disoccluded(loaded, settings, kinds[m], m != "ReSTIR", bar))
              for k, m in enumerate(kinds)}  # fmt: skip
     exposures = metrics.flip_exposures(reference)
     flip = {m: float(np.mean([metrics.flip(i, reference, exposures).mean for i in p.arrays["images"]]))
@@ -195,7 +195,8 @@ def figure_7(work: Work) -> Outcome:
     return Outcome(statements, {}, pictures, [*NOTES, more])
 
 
-def _disoccluded(loaded, settings: Disocclusion, keys: dict, neural: bool, bar) -> Part:
+def disoccluded(loaded, settings: Disocclusion, keys: dict, neural: bool, bar) -> Part:
+    """Frames of ReSTIR that reuses no earlier frame, with light candidates by power or (`neural`) by visibility."""
     sampler = {"light_sampler.type": "nvc_lights", "light_sampler.preset": "paper", "light_sampler.train_steps": 0,
                "light_sampler.outputs": settings.outputs, "light_sampler.train_frames": settings.train}  # fmt: skip
     restir = measures.make(loaded, "restir_di", preset="paper", **keys, **(sampler if neural else {}))

@@ -6,16 +6,23 @@ import difflib
 
 from mi_neural.bench.load import InputError
 
-from . import fsr, nirc, nirc_images, nvc, nvc_settings, reliability
+from . import fsr, made_scenes, nirc, nirc_images, nvc, nvc_settings, reliability
 from .entry import SOURCES, Entry
+
+
+def _of(source: str, *modules) -> list[Entry]:
+    """The entries of a source, by name."""
+    found = [e for m in modules for e in m.ENTRIES if e.name.partition("/")[0] == source]
+    return sorted(found, key=lambda entry: entry.name)
+
 
 #: All entries by name, in the order of the list.
 ENTRIES: dict[str, Entry] = {
     entry.name: entry
     for entry in (
         *reliability.ENTRIES,
-        *sorted((*nirc.ENTRIES, *nirc_images.ENTRIES), key=lambda entry: entry.name),
-        *sorted((*nvc.ENTRIES, *nvc_settings.ENTRIES), key=lambda entry: entry.name),
+        *_of("nirc", nirc, nirc_images, made_scenes),
+        *_of("nvc", nvc, nvc_settings, made_scenes),
         *fsr.ENTRIES,
     )
 }
