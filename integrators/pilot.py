@@ -10,9 +10,12 @@ from dataclasses import asdict, dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
-from mi_neural.estimators import two_level
+from mi_neural.caches.outlook import Outlook
+from mi_neural.estimators import roulette, two_level
 from mi_neural.render.film import Area
+from mi_neural.render.kernels import on_gpu
 
 #: α by place, as a number among the settings.
 BY_PLACE = -1.0
@@ -24,6 +27,8 @@ WORTH = 2**22
 BANDS = 4
 #: Share of the pixels with the largest variance that is left out when candidates are compared.
 TRIM = 0.002
+#: Pixels whose samples tell the level of one: the width of the film over this.
+NEIGHBOURS = 16
 #: How much better than path tracing a division must measure, twice, before it is taken: what chance alone may do.
 MARGIN = 1.08
 #: A first division that asks the cache and costs this many times path tracing's variance times time: the others of its
@@ -36,22 +41,25 @@ LOOK_FRAMES = 32
 @dataclass(frozen=True)
 class Split:
     """How a camera sample is divided: `n_cache` directions in which the cache is queried, `n_traced` for direct light,
-    of which each goes on with `probability`, and the coefficient `alpha`, negative: by place."""
+    of which each goes on with `probability`, the coefficient `alpha`, negative: by place, and the strength of the
+    `roulette` by what lies ahead, 0: by throughput."""
 
     n_cache: int = 0
     n_traced: int = 1
     probability: float = 1.0
     alpha: float = 0.0
+    roulette: float = 0.0
 
     def numbers(self) -> tuple:
-        return float(self.n_traced), float(self.n_cache), float(self.probability), float(self.alpha)
+        numbers = self.n_traced, self.n_cache, self.probability, self.alpha, self.roulette
+        return tuple(float(v) for v in numbers)
 
     def __str__(self):
+        ends = f", roulette {self.roulette:.2g}" if self.roulette > 0 else ""
         if self.alpha == 0 and self.probability == 1:
-            return f"path tracing, {self.n_traced} path{'s' * (self.n_traced > 1)}"
+            return f"path tracing, {self.n_traced} path{'s' * (self.n_traced > 1)}{ends}"
         alpha = "by place" if self.alpha < 0 else f"{self.alpha:g}"
-        return f"Nc {self.n_cache}, Nr {self.n_traced * self.probability:g}, alpha {alpha}"
-
+        return f"Nc {self.n_cache}, Nr {self.n_traced * self.probability:g}, alpha {alpha}{ends}"
 
 
 class Choice:
@@ -60,7 +68,7 @@ class Choice:
     Raises ValueError for keys out of range.
     """
 
-    def __init__(self, cache_samples, residual_samples, residual_probability, alpha):
+    def __init__(self, cache_samples, residual_samples, residual_probability, alpha, roulette=None):
         if cache_samples is not None and cache_samples < 0:
             raise ValueError(f"cache_samples is {cache_samples}; give 0 (path tracing) or more")
         if residual_samples is not None and residual_samples < 1:
@@ -72,14 +80,19 @@ class Choice:
             raise ValueError(f"alpha is '{alpha}'; give 'cell' or a number in [0, 1]")
         if alpha is not None and not isinstance(alpha, str) and not 0 <= alpha <= 1:
             raise ValueError(f"alpha is {alpha}; give 'cell' or a number in [0, 1]")
+        if roulette is not None and not (0 <= roulette < math.inf):
+            raise ValueError(f"roulette is {roulette}; give 0 (by throughput) or a positive number")
         if cache_samples == 0:
             if alpha not in (None, 0):
                 raise ValueError(f"alpha is {alpha}, but cache_samples is 0: there is no cache to weigh; leave one out")
             alpha, residual_probability = 0.0, 1.0 if residual_probability is None else residual_probability
         self.given = {
             "n_cache": cache_samples, "n_traced": residual_samples, "probability": residual_probability,
-            "alpha": BY_PLACE if alpha == "cell" else alpha,
+            "alpha": BY_PLACE if alpha == "cell" else alpha, "roulette": roulette,
         }  # fmt: skip
+        others = [v for k, v in self.given.items() if k != "roulette"]
+        if roulette is None and (not self.may_ask or None not in others):
+            self.given["roulette"] = 0.0
         self.reset()
 
     @property
@@ -92,7 +105,19 @@ class Choice:
         """Whether a division could ask the cache."""
         return self.given["alpha"] != 0 and self.given["n_cache"] != 0
 
+    @property
+    def may_foresee(self) -> bool:
+        """Whether a division could have paths end by what lies ahead."""
+        return self.given["roulette"] != 0
+
+    def look_ahead(self, integrator, scene, sensor, anew: bool = False) -> None:
+        """See that there is an outlook."""
+        if self.outlook is None or anew:
+            view = integrator._view(sensor)
+            self.outlook = Outlook.learn(scene, view, integrator.bound_lights, integrator.seed ^ 0x6F75746C)
+
     def reset(self) -> None:
+        self.outlook: Outlook | None = None
         known = {k: v for k, v in self.given.items() if v is not None}
         if self.may_ask and "n_cache" not in known:
             known["n_cache"] = 4
@@ -109,10 +134,10 @@ class Choice:
 
     def state(self) -> tuple:
         """All that measuring changes, for :meth:`restore`."""
-        return self.split, self.table, self.measured_at, self.seconds
+        return self.split, self.table, self.measured_at, self.seconds, self.outlook
 
     def restore(self, state: tuple) -> None:
-        self.split, self.table, self.measured_at, self.seconds = state
+        self.split, self.table, self.measured_at, self.seconds, self.outlook = state
 
     def candidates(self) -> list[Split]:
         """Divisions to compare, path tracing first where it is one."""
@@ -128,7 +153,8 @@ class Choice:
             shares = options("probability", [1.0] if a == 0 else [1.0, 0.5, 0.25])
             n_cache = options("n_cache", [4])[0] if a != 0 else 0
             found += [Split(n_cache, n, q, a) for n, q in itertools.product(paths, shares) if (n, q) != (2, 0.25)]
-        return found
+        given = self.given["roulette"] or 0.0
+        return [replace(s, roulette=given) for s in found]
 
     def know_alpha(self, integrator, scene, sensor, by_place: bool) -> None:
         """See that there is an α by place, where one is asked for: a cache from elsewhere has none yet."""
@@ -165,6 +191,8 @@ class Choice:
             n_cache = self._n_cache(best, next(t for t in asking if self.split_of(t) == best), eight)
             if n_cache not in (4, 8):
                 self.table.append(pilot.facts(replace(best, n_cache=n_cache)))
+        if self.given["roulette"] is None:
+            self._compare_roulettes(pilot)
         base = self.table[0]["cost"]
         for t in self.table:
             t["efficiency"] = base / t["cost"] if t["cost"] > 0 else math.inf
@@ -175,9 +203,24 @@ class Choice:
             if again[0] >= MARGIN * again[1]:
                 self.split = self.split_of(best)
 
+    def _compare_roulettes(self, pilot) -> None:
+        """The best of the divisions by their number of paths, with roulette by what lies ahead; then half and twice its
+        strength."""
+        self.look_ahead(pilot.integrator, pilot.scene, pilot.sensor, anew=True)
+        strength = roulette.strength_of(self.table[0]["variance"])
+        if strength <= 0:
+            return
+        best = {}
+        for t in sorted(self.table, key=lambda t: -t["cost"]):
+            best[t["n_traced"]] = t
+        tried = [pilot.facts(replace(self.split_of(t), roulette=strength)) for t in best.values()]
+        first = self.split_of(min(tried, key=lambda t: t["cost"]))
+        tried += [pilot.facts(replace(first, roulette=f * strength)) for f in (0.5, 2.0)]
+        self.table += tried
+
     @staticmethod
     def split_of(facts: dict) -> Split:
-        return Split(**{k: facts[k] for k in ("n_cache", "n_traced", "probability", "alpha")})
+        return Split(**{k: facts[k] for k in ("n_cache", "n_traced", "probability", "alpha", "roulette")})
 
     @staticmethod
     def _n_cache(best: Split, four: dict, eight: dict) -> int:
@@ -194,6 +237,11 @@ class Choice:
         return facts | ({"pilot": self.table} if self.table else {})
 
 
+def clock() -> float:
+    """Seconds to compare work by: those of the processors where they do the work, so that other programs count less."""
+    return time.perf_counter() if on_gpu() else time.process_time()
+
+
 class Pilot:
     """Variance and time of divisions of a camera sample, on bands of rows of the film."""
 
@@ -204,6 +252,7 @@ class Pilot:
         bands = BANDS if area.height >= BANDS else 1
         self.first = [int((k + 0.5) * area.height / BANDS - self.rows / 2) for k in range(bands)]
         self.spp = max(1, min(16, PILOT_SAMPLES // (area.width * self.rows * bands)))
+        self.level = None
         self.samples = area.width * self.rows * self.spp * bands
 
     def run(self, split: Split, passes: int = PILOT_PASSES, first_seed: int = 0):
@@ -211,7 +260,7 @@ class Pilot:
         images, seconds = [], []
         for k in range(first_seed * passes, (first_seed + 1) * passes):
             dr.sync_thread()
-            t0 = time.perf_counter()
+            t0 = clock()
             bands = []
             for y in self.first:
                 _, values = self.integrator.render_rows(
@@ -220,16 +269,25 @@ class Pilot:
                 bands.append(mi.luminance(mi.Color3f(*values[:3])) / self.spp)
             dr.eval(bands)
             dr.sync_thread()
-            seconds.append(time.perf_counter() - t0)
+            seconds.append(clock() - t0)
             images.append(np.concatenate([np.array(b) for b in bands]))
         return np.stack(images).astype(np.float64), seconds  # squares of what is dim are 0 in single precision
+
+    def _level(self, mean):
+        """The squared luminance of pixels, from few samples: means over neighbours. That of a pixel alone would be high
+        where a rare bright path is among its samples, and hide it."""
+        width = mean.size // (self.rows * len(self.first))
+        rows = mean.reshape(-1, self.rows, width).mean(axis=1)
+        smooth = uniform_filter1d(rows, max(1, width // NEIGHBOURS), axis=1, mode="nearest")
+        level = np.broadcast_to(smooth[:, None], (len(rows), self.rows, width)).ravel()
+        return level**2 + 0.01 * max(float(mean.mean()), 1e-30) ** 2
 
     def facts(self, split: Split, first_seed: int = 0) -> dict:
         """A division with its mean relative variance of one camera sample, seconds a sample, and their product."""
         images, seconds = self.run(split, first_seed=first_seed)
-        mean, variance = images.mean(axis=0), images.var(axis=0, ddof=1) * self.spp
-        floor = 0.01 * max(float(mean.mean()), 1e-30) ** 2
-        relative = np.sort(variance / (mean**2 + floor))
+        if self.level is None:
+            self.level = self._level(images.mean(axis=0))
+        relative = np.sort(images.var(axis=0, ddof=1) * self.spp / self.level)
         relative = float(relative[: max(1, int(relative.size * (1 - TRIM)))].mean())
         each = float(np.median(seconds)) / self.samples
         return asdict(split) | {"variance": relative, "seconds": each, "cost": relative * each}
