@@ -361,8 +361,8 @@ class _Ends:
         if self.outlook is None:
             return plain
         smooth = vertex.is_smooth(path.si, path.active) & self.foresees
-        expected = mi.luminance(path.β) * self.outlook.ahead_at(path.si, smooth)
-        return dr.select(smooth, roulette.survival(expected, self.level, self.strength, roulette.LEAST), plain)
+        expected, least = mi.luminance(path.β) * self.outlook.ahead_at(path.si, smooth), roulette.least_of(dr.max(path.β))
+        return dr.select(smooth, roulette.survival(expected, self.level, self.strength, least), plain)
 
     def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
         """Direct light, shadow rays being left out by chance where little light is expected to arrive."""
@@ -384,7 +384,8 @@ class _Shaded(paths.Surface):
         sampled &= dr.max(f * light) > 0
         visible = ends.outlook.visible_at(self.it, sampled & ends.foresees)
         expected = mi.luminance(self.β * f * light) * dr.sqrt(visible)
-        q = roulette.survival(expected, ends.level, ends.strength, roulette.LEAST_SHADOW)
+        least = dr.clip(roulette.LEAST_SHADOW * dr.max(self.β), roulette.LEAST_SHADOW, 1)
+        q = roulette.survival(expected, ends.level, ends.strength, least)
         sampled &= sampler.next_1d() < q
         sampled &= ~scene.ray_test(self.it.spawn_ray_to(ds.p), sampled)
         return light / q, sampled, sampler

@@ -15,7 +15,7 @@ from ..render import path as paths
 from ..render import vertex
 from ..render.film import film_rays
 from ..render.sampling import PathSampler
-from .voxels import Voxels, cell_sums, main_side
+from .voxels import Voxels, main_side
 
 #: Cells along the longest axis of the box of what paths meet, and entries of the table.
 CELLS, ENTRIES = 32, 2**16
@@ -81,16 +81,17 @@ class Outlook:
         return self
 
     def _fill(self, p, side, target, valid, light) -> None:
-        sampled, arrived = light
-        index = self.voxels.entry(p, ENTRIES, side)
-        one = mi.Float(1)
-        values = [dr.select(valid, target, 0), one, dr.select(sampled, one, 0), dr.select(arrived, one, 0)]
-        total, n, n_sampled, n_arrived = cell_sums(values, index, valid, ENTRIES)
-        mean = dr.sum(total) / dr.maximum(dr.sum(n), 1)
-        self.mean = mean
-        self.ahead = (total + PRIOR * mean) / (n + PRIOR)
-        self.visible = (n_arrived + 0.5) / (n_sampled + 0.5)
-        dr.eval(self.mean, self.ahead, self.visible)
+        """Means by cell. Added up in memory order: sums of atomic additions differ from run to run."""
+        valid = np.array(valid)
+        index = np.array(self.voxels.entry(p, ENTRIES, side))[valid]
+        target, sampled, arrived = (np.array(v)[valid].astype(np.float64) for v in (target, *light))
+        n = np.bincount(index, minlength=ENTRIES)
+        total, n_sampled, n_arrived = (np.bincount(index, v, ENTRIES) for v in (target, sampled, arrived))
+        mean = total.sum() / max(n.sum(), 1)
+        self.mean = mi.Float(float(mean))
+        self.ahead = mi.Float(((total + PRIOR * mean) / (n + PRIOR)).astype(np.float32))
+        self.visible = mi.Float(((n_arrived + 0.5) / (n_sampled + 0.5)).astype(np.float32))
+        dr.make_opaque(self.mean, self.ahead, self.visible)
 
 
 class _Watched(paths.Surface):

@@ -15,7 +15,7 @@ import math
 
 import drjit as dr
 
-#: Least probability with which a path goes on: its light has at most 1 / this times the weight.
+#: Least probability with which a path goes on, see :func:`least_of`.
 LEAST = 0.1
 #: Least probability with which a shadow ray is traced.
 LEAST_SHADOW = 0.05
@@ -32,6 +32,11 @@ def survival(expected, level, strength, least):
     """
     q = dr.clip(expected / dr.maximum(strength * level, 1e-30), least, 1)
     return dr.select(strength > 0, dr.select(dr.isfinite(q), q, 1), 1)
+
+
+def least_of(weight):
+    """Least probability with which a path of this throughput goes on: it then has at most 1 / `LEAST`, at every vertex."""
+    return dr.clip(LEAST * weight, LEAST, 1)
 
 
 def strength_of(variance: float) -> float:
