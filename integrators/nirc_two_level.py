@@ -12,7 +12,7 @@ import numpy as np
 from mi_neural.caches.control import ControlCache
 from mi_neural.caches.material import material_of
 from mi_neural.caches.outlook import Outlook
-from mi_neural.estimators import roulette, two_level
+from mi_neural.estimators import two_level
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators import pilot, progressive
 from mi_neural.integrators.incident import INCIDENT_KEYS, INCIDENT_PRESETS, IncidentIntegrator
@@ -21,6 +21,7 @@ from mi_neural.integrators.pilot import Split
 from mi_neural.integrators.progressive import UNBIASED, Parts
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
+from mi_neural.render.ends import Ends
 
 MODES = ("unbiased", "progressive")
 #: Share of the scene's mean radiance that RIS grants every direction, so that light unknown to the cache is found.
@@ -215,7 +216,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
         helps = (n_cache > n_traced) | (probability < 1)  # elsewhere the cache's terms cancel
         first = _FirstVertex(self, field, path, alpha, helps, n_cache)
-        ends = _Ends(self, outlook, strength, path)
+        ends = Ends(outlook, strength, path, self.rr_depth)
         beyond = partial(self.suffix, scene, lights, field, alpha=alpha, ends=ends)
 
         none = Sums(*(mi.Color3f(0) for _ in range(3)), mi.Float(0))
@@ -265,7 +266,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         """Light that ``path.si`` reflects back along ``path.ray``, times ``path.β``; in ``path.L`` of the result.
 
         Path tracing; with `every_vertex` the cache is a control variate at each vertex. `ends` says with which
-        probability paths go on (:class:`_Ends`). Returns (path, sampler).
+        probability paths go on (:class:`~mi_neural.render.ends.Ends`). Returns (path, sampler).
         """
         controls = self.every_vertex and self.choice.may_ask and field is not None
 
@@ -338,57 +339,6 @@ class Foreseen:
 
     def parts(self) -> tuple:
         return self.field, self.outlook
-
-
-class _Ends:
-    """Where paths end: with which probability they go on, and a shadow ray is traced.
-
-    By the throughput from the camera, as in ``path``; where `strength` is positive by the radiance that an `outlook`
-    expects, relative to that of the first vertex, where `first` stands.
-    """
-
-    def __init__(self, integrator, outlook, strength, first):
-        self.outlook, self.strength, self.rr_depth, self.β_first = outlook, strength, integrator.rr_depth, first.β
-        if outlook is None:
-            self.direct = None
-            return
-        self.foresees = strength > 0
-        self.level = outlook.level_at(first.si, first.active & self.foresees)
-
-    def survival(self, path):
-        """Probability that a path goes on from where it has arrived."""
-        plain = paths.survival(path, self.rr_depth, self.β_first)
-        if self.outlook is None:
-            return plain
-        smooth = vertex.is_smooth(path.si, path.active) & self.foresees
-        expected, least = mi.luminance(path.β) * self.outlook.ahead_at(path.si, smooth), roulette.least_of(dr.max(path.β))
-        return dr.select(smooth, roulette.survival(expected, self.level, self.strength, least), plain)
-
-    def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
-        """Direct light, shadow rays being left out by chance where little light is expected to arrive."""
-        here = _Shaded(path, bsdf, found, self)
-        return paths.direct_light(scene, lights, path, bsdf, found, numbers, sampler, alone, here)
-
-
-class _Shaded(paths.Surface):
-    """A surface whose shadow rays are traced with a probability: E[light arriving] is kept."""
-
-    untested = True
-
-    def __init__(self, path, bsdf, found, ends: _Ends):
-        super().__init__(path, bsdf, found)
-        self.β, self.ends = path.β, ends
-
-    def light_arriving(self, scene, tested, ds, light, f, sampled, sampler):
-        ends = self.ends
-        sampled &= dr.max(f * light) > 0
-        visible = ends.outlook.visible_at(self.it, sampled & ends.foresees)
-        expected = mi.luminance(self.β * f * light) * dr.sqrt(visible)
-        least = dr.clip(roulette.LEAST_SHADOW * dr.max(self.β), roulette.LEAST_SHADOW, 1)
-        q = roulette.survival(expected, ends.level, ends.strength, least)
-        sampled &= sampler.next_1d() < q
-        sampled &= ~scene.ray_test(self.it.spawn_ray_to(ds.p), sampled)
-        return light / q, sampled, sampler
 
 
 class _FirstVertex:

@@ -2,10 +2,10 @@
 
 Pairs of paths share all random numbers up to vertex k, and have their own from there on. Half of the mean squared
 difference of such a pair is the variance that is made at vertex k and behind it: what an exact cache of outgoing
-radiance, asked at vertex k, would take away. It is divided into next-event estimation at k, emitters that the BSDF sample
-of k meets, and what lies behind: light of later vertices. Shares are of the relative variance of one camera sample,
-averaged over the pixels but the 0.1 % with the largest total. Where rare bright paths make the variance, it takes
-hundreds of pairs.
+radiance, asked at vertex k, would take away. It is divided into next-event estimation at k, emitters that the BSDF
+sample of k meets, and what lies behind: light of later vertices. Shares are of the relative variance of one camera
+sample, averaged over the pixels but the 0.1 % with the largest total. Where rare bright paths make the variance, it
+takes hundreds of pairs.
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ def main(arguments: list[str] | None = None) -> int:
     found = measure(loaded.scene, options.vertices, options.pairs)
     print(f"{loaded.name}: mean {found['mean']:.4g}, relative variance of a sample {found['variance']:.3g}")
     for r in found["rows"]:
-        print(f"vertex {r['vertex']} and behind {r['all']:.3f}: next-event {r['nee']:.3f}, emitters met {r['hit']:.3f}, "
-              f"behind {r['behind']:.3f}")  # fmt: skip
+        print(f"vertex {r['vertex']} and behind {r['all']:.3f}: next-event {r['nee']:.3f}, emitters met "
+              f"{r['hit']:.3f}, behind {r['behind']:.3f}")  # fmt: skip
     if options.output:
         exr.write_text(options.output, json.dumps(
             {"scene": loaded.name, "size": options.size, "pairs": options.pairs, **found,

@@ -38,7 +38,7 @@ def tell(integrator, kind: str) -> None:
 
 
 def check(bench, name, kind, splits, cache="trained", **keys):
-    integrator, learned = bench.integrator(name, **KEYS, **keys)
+    integrator, _ = bench.integrator(name, **KEYS, **keys)
     integrator.choice.outlook = None
     integrator.bind(bench.scene(name), bench.scene(name).sensors()[0], train=False)
     tell(integrator, kind)
@@ -52,6 +52,13 @@ def test_probability_is_one_where_nothing_is_to_be_left_out():
     expected = mi.Float([0.0, 1.0, np.inf, np.nan])
     assert np.array(roulette.survival(expected, 1, 0, 0.1)).tolist() == [1, 1, 1, 1]
     assert np.array(roulette.survival(expected, 2, 1, 0.1)).tolist() == pytest.approx([0.1, 0.5, 1, 1])
+
+
+def test_weights_of_paths_are_bounded():
+    weights = mi.Float([0.01, 0.5, 1.0, 5.0, 10.0, 100.0])
+    q = roulette.least_of(weights)
+    assert np.array(q).tolist() == pytest.approx([0.1, 0.1, 0.1, 0.5, 1, 1])
+    assert (np.array(weights / q)[:5] <= 10 + 1e-4).all()
 
 
 @pytest.mark.parametrize("level", [0.0, -1.0, np.nan, np.inf])
@@ -90,8 +97,8 @@ def test_light_samples_in_the_shade_are_known(bench):
 
 
 def test_outlook_of_darkness_is_nothing():
-    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "light": {"type": "constant", "radiance": 0.0},
-                          "floor": {"type": "sphere", "center": [0, 0, 5]}})  # fmt: skip
+    ball, light = {"type": "sphere", "center": [0, 0, 5]}, {"type": "constant", "radiance": 0.0}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "ball": ball, "light": light})
     outlook = Outlook.learn(scene, scene.sensors()[0], None, 0, n_paths=256)
     assert np.isfinite(np.array(outlook.ahead)).all() and float(outlook.mean[0]) == 0
 

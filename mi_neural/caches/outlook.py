@@ -136,9 +136,7 @@ def _trace(scene, sensor, lights, seed: int, n: int) -> tuple:
             dr.scatter(array, value, k, takes)
         return paths.roulette(paths.advance(path, found), sampler, N_VERTICES)
 
-    path, _ = dr.while_loop(
-        (path, sampler), lambda path, sampler: path.active, step, label="paths of an outlook"
-    )
+    path, _ = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="paths of an outlook")
     L = mi.luminance(path.L)
     dr.eval(L, zeros, facts)
     all_L = dr.gather(mi.Float, L, dr.arange(mi.UInt32, size) % n)
