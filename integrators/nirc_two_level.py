@@ -46,7 +46,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         given = {
             "cache_samples": props.get("cache_samples", None), "residual_samples": props.get("residual_samples", None),
             "residual_probability": props.get("residual_probability", None), "alpha": props.get("alpha", None),
-            "roulette": props.get("roulette", None),
+            "roulette": props.get("roulette", None), "guide": props.get("guide", None),
         }  # fmt: skip
         self._check(self.mode in MODES, f"mode is '{self.mode}'; give one of: {', '.join(MODES)}")
         self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; the two-level estimator needs 'ema'")
@@ -81,7 +81,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
 
     @property
     def trains(self) -> bool:
-        return super().trains or (self.split.roulette > 0 and self.choice.outlook is None)
+        return super().trains or self.choice.must_look_ahead
 
     @property
     def split(self) -> Split:
@@ -126,7 +126,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
 
     def bind(self, scene, sensor, train: bool = True) -> None:
         super().bind(scene, sensor, train)
-        if self.split.roulette > 0:
+        if self.choice.must_look_ahead:
             self.choice.look_ahead(self, scene, sensor)
         if not self.choice.may_ask or self.state.image_open or not (train or self.compiling):
             return
@@ -210,13 +210,13 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
 
     def estimate(self, scene, lights, field, sampler, ray, settings, active):
         """E[L] is path tracing's, whatever the cache: direct light + :func:`two_level.combine` at the first vertex."""
-        n_traced, n_cache, probability, alpha, strength = settings
+        n_traced, n_cache, probability, alpha, strength, guide = settings
         field, outlook = field.parts() if isinstance(field, Foreseen) else (field, None)
         path = paths.camera_vertex(self, scene, ray, active)
         path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
         helps = (n_cache > n_traced) | (probability < 1)  # elsewhere the cache's terms cancel
-        first = _FirstVertex(self, field, path, alpha, helps, n_cache)
-        ends = Ends(outlook, strength, path, self.rr_depth)
+        ends = Ends(outlook, strength, guide, path, self.rr_depth)
+        first = _FirstVertex(self, field, path, alpha, helps, n_cache, ends)
         beyond = partial(self.suffix, scene, lights, field, alpha=alpha, ends=ends)
 
         none = Sums(*(mi.Color3f(0) for _ in range(3)), mi.Float(0))
@@ -271,7 +271,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         controls = self.every_vertex and self.choice.may_ask and field is not None
 
         def step(path, sampler):
-            found, sampler = paths.bounce(scene, lights, path, sampler, direct=ends.direct)
+            found, sampler = paths.bounce(scene, lights, path, sampler, bsdf=ends.bsdf(path), direct=ends.direct)
             after = paths.advance(path, found, self.depth_limit)
             u = sampler.together_1d(dimension + after.depth)
             q = ends.survival(after)
@@ -349,16 +349,16 @@ class _FirstVertex:
     queried   where the cache is queried; `helps` says whether its terms do anything
     """
 
-    def __init__(self, integrator, field, path, alpha, helps, n_cache):
+    def __init__(self, integrator, field, path, alpha, helps, n_cache, ends):
         self.integrator, self.field, self.path = integrator, field, path
-        self.bsdf = path.si.bsdf(path.ray)
+        self.bsdf = ends.bsdf(path)
         self.here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
         self.α, self.features, self.queried = mi.Float(0), None, mi.Bool(False)
         if integrator.choice.may_ask and field is not None:
             queried = vertex.is_smooth(path.si, path.active) & helps
             self.α = integrator.coefficient(field, path.si, alpha, queried)
             self.queried = queried & ((self.α > 0) | (mi.Bool(integrator.ris) & (n_cache > 1)))
-            more = material_of(field, path.si, self.bsdf, self.queried)
+            more = material_of(field, path.si, path.si.bsdf(path.ray), self.queried)
             self.features = field.encode(path.si.p, vertex.facing(path.si), self.queried, **more)
 
     def candidate(self, lobe, direction) -> tuple:
@@ -488,6 +488,10 @@ NIRCTwoLevelIntegrator.__doc__ = (
          this number; what is expected comes from a table of cells, learned from ``2^17`` paths. The best is about 0.2
          times the relative standard deviation of a sample. (Default: measured, together with the keys above; 0 where
          these are all given, where ``cache_samples`` or ``alpha`` is 0, and with ``mode=progressive``)
+     * - guide
+       - |float|
+       - Share, in [0, 1), of directions that come from tables of where light came from, in cells, learned from ``2^19``
+         paths; the others come from the BSDF. (Default: measured, 0 or 1/2; 0 where ``roulette`` is)
      * - every_vertex
        - |bool|
        - Use the cache as a control variate at each vertex of the residual path, too, with two queries a vertex.

@@ -15,7 +15,7 @@ from scipy.ndimage import uniform_filter1d
 from mi_neural.caches.outlook import Outlook
 from mi_neural.estimators import roulette, two_level
 from mi_neural.render.film import Area
-from mi_neural.render.kernels import on_gpu
+from mi_neural.render.kernels import work_seconds
 
 #: α by place, as a number among the settings.
 BY_PLACE = -1.0
@@ -34,6 +34,8 @@ MARGIN = 1.08
 #: A first division that asks the cache and costs this many times path tracing's variance times time: the others of its
 #: kind are not measured (in eight scenes none was ever the best then).
 HOPELESS = 1.25
+#: Share of directions from the guide that is compared with none.
+GUIDED = 0.5
 #: Frames of records that give α by place for a cache that was trained elsewhere.
 LOOK_FRAMES = 32
 
@@ -41,21 +43,23 @@ LOOK_FRAMES = 32
 @dataclass(frozen=True)
 class Split:
     """How a camera sample is divided: `n_cache` directions in which the cache is queried, `n_traced` for direct light,
-    of which each goes on with `probability`, the coefficient `alpha`, negative: by place, and the strength of the
-    `roulette` by what lies ahead, 0: by throughput."""
+    of which each goes on with `probability`, the coefficient `alpha`, negative: by place, the strength of `roulette` by
+    what lies ahead, 0: by throughput, and the share of directions from the `guide`."""
 
     n_cache: int = 0
     n_traced: int = 1
     probability: float = 1.0
     alpha: float = 0.0
     roulette: float = 0.0
+    guide: float = 0.0
 
     def numbers(self) -> tuple:
-        numbers = self.n_traced, self.n_cache, self.probability, self.alpha, self.roulette
+        numbers = self.n_traced, self.n_cache, self.probability, self.alpha, self.roulette, self.guide
         return tuple(float(v) for v in numbers)
 
     def __str__(self):
         ends = f", roulette {self.roulette:.2g}" if self.roulette > 0 else ""
+        ends += f", guide {self.guide:.2g}" if self.guide > 0 else ""
         if self.alpha == 0 and self.probability == 1:
             return f"path tracing, {self.n_traced} path{'s' * (self.n_traced > 1)}{ends}"
         alpha = "by place" if self.alpha < 0 else f"{self.alpha:g}"
@@ -68,7 +72,7 @@ class Choice:
     Raises ValueError for keys out of range.
     """
 
-    def __init__(self, cache_samples, residual_samples, residual_probability, alpha, roulette=None):
+    def __init__(self, cache_samples, residual_samples, residual_probability, alpha, roulette=None, guide=None):
         if cache_samples is not None and cache_samples < 0:
             raise ValueError(f"cache_samples is {cache_samples}; give 0 (path tracing) or more")
         if residual_samples is not None and residual_samples < 1:
@@ -82,6 +86,8 @@ class Choice:
             raise ValueError(f"alpha is {alpha}; give 'cell' or a number in [0, 1]")
         if roulette is not None and not (0 <= roulette < math.inf):
             raise ValueError(f"roulette is {roulette}; give 0 (by throughput) or a positive number")
+        if guide is not None and not (0 <= guide < 1):
+            raise ValueError(f"guide is {guide}; it must lie in [0, 1)")
         if cache_samples == 0:
             if alpha not in (None, 0):
                 raise ValueError(f"alpha is {alpha}, but cache_samples is 0: there is no cache to weigh; leave one out")
@@ -89,10 +95,13 @@ class Choice:
         self.given = {
             "n_cache": cache_samples, "n_traced": residual_samples, "probability": residual_probability,
             "alpha": BY_PLACE if alpha == "cell" else alpha, "roulette": roulette,
+            "guide": guide,
         }  # fmt: skip
-        others = [v for k, v in self.given.items() if k != "roulette"]
+        others = [v for k, v in self.given.items() if k not in ("roulette", "guide")]
         if roulette is None and (not self.may_ask or None not in others):
             self.given["roulette"] = 0.0
+        if guide is None and self.given["roulette"] is not None:
+            self.given["guide"] = 0.0
         self.reset()
 
     @property
@@ -108,13 +117,21 @@ class Choice:
     @property
     def may_foresee(self) -> bool:
         """Whether a division could have paths end by what lies ahead."""
-        return self.given["roulette"] != 0
+        return self.given["roulette"] != 0 or self.given["guide"] != 0
+
+    @property
+    def must_look_ahead(self) -> bool:
+        """Whether the division in use needs what is not known yet."""
+        looks, guided = self.split.roulette > 0 or self.split.guide > 0, self.split.guide > 0
+        return (looks and self.outlook is None) or (guided and self.outlook.guide is None)
 
     def look_ahead(self, integrator, scene, sensor, anew: bool = False) -> None:
-        """See that there is an outlook."""
+        """See that there is an outlook, with a guide if the division has one."""
+        given = scene, integrator._view(sensor), integrator.bound_lights, integrator.seed ^ 0x6F75746C
         if self.outlook is None or anew:
-            view = integrator._view(sensor)
-            self.outlook = Outlook.learn(scene, view, integrator.bound_lights, integrator.seed ^ 0x6F75746C)
+            self.outlook = Outlook.learn(*given)
+        if self.split.guide > 0:
+            self.outlook.learn_guide(*given)
 
     def reset(self) -> None:
         self.outlook: Outlook | None = None
@@ -153,8 +170,8 @@ class Choice:
             shares = options("probability", [1.0] if a == 0 else [1.0, 0.5, 0.25])
             n_cache = options("n_cache", [4])[0] if a != 0 else 0
             found += [Split(n_cache, n, q, a) for n, q in itertools.product(paths, shares) if (n, q) != (2, 0.25)]
-        given = self.given["roulette"] or 0.0
-        return [replace(s, roulette=given) for s in found]
+        given = {k: self.given[k] or 0.0 for k in ("roulette", "guide")}
+        return [replace(s, **given) for s in found]
 
     def know_alpha(self, integrator, scene, sensor, by_place: bool) -> None:
         """See that there is an α by place, where one is asked for: a cache from elsewhere has none yet."""
@@ -202,6 +219,8 @@ class Choice:
             again = pilot.facts(splits[0], first_seed=1)["cost"], pilot.facts(self.split_of(best), first_seed=1)["cost"]
             if again[0] >= MARGIN * again[1]:
                 self.split = self.split_of(best)
+        if self.split.guide == 0 and self.outlook is not None:
+            self.outlook.guide = None  # it would be asked for nothing
 
     def _compare_roulettes(self, pilot) -> None:
         """The best of the divisions by their number of paths, with roulette by what lies ahead; then half and twice its
@@ -217,10 +236,15 @@ class Choice:
         first = self.split_of(min(tried, key=lambda t: t["cost"]))
         tried += [pilot.facts(replace(first, roulette=f * strength)) for f in (0.5, 2.0)]
         self.table += tried
+        if self.given["guide"] is None:
+            self.split = replace(self.split_of(min(tried, key=lambda t: t["cost"])), guide=GUIDED)
+            self.look_ahead(pilot.integrator, pilot.scene, pilot.sensor)
+            pilot.run(self.split, passes=1)  # kernels
+            self.table.append(pilot.facts(self.split))
 
     @staticmethod
     def split_of(facts: dict) -> Split:
-        return Split(**{k: facts[k] for k in ("n_cache", "n_traced", "probability", "alpha", "roulette")})
+        return Split(**{k: facts[k] for k in ("n_cache", "n_traced", "probability", "alpha", "roulette", "guide")})
 
     @staticmethod
     def _n_cache(best: Split, four: dict, eight: dict) -> int:
@@ -235,11 +259,6 @@ class Choice:
     def statistics(self) -> dict:
         facts = {"split": str(self.split), "seconds_pilot": self.seconds}
         return facts | ({"pilot": self.table} if self.table else {})
-
-
-def clock() -> float:
-    """Seconds to compare work by: those of the processors where they do the work, so that other programs count less."""
-    return time.perf_counter() if on_gpu() else time.process_time()
 
 
 class Pilot:
@@ -259,8 +278,7 @@ class Pilot:
         """(luminance by pass and pixel, seconds of each pass)."""
         images, seconds = [], []
         for k in range(first_seed * passes, (first_seed + 1) * passes):
-            dr.sync_thread()
-            t0 = clock()
+            t0 = work_seconds()
             bands = []
             for y in self.first:
                 _, values = self.integrator.render_rows(
@@ -268,8 +286,7 @@ class Pilot:
                 )
                 bands.append(mi.luminance(mi.Color3f(*values[:3])) / self.spp)
             dr.eval(bands)
-            dr.sync_thread()
-            seconds.append(clock() - t0)
+            seconds.append(work_seconds() - t0)
             images.append(np.concatenate([np.array(b) for b in bands]))
         return np.stack(images).astype(np.float64), seconds  # squares of what is dim are 0 in single precision
 

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from two_level_bench import SLOW, Bench, render, split_of
 
+from mi_neural.caches import guide as guides
 from mi_neural.caches.outlook import ENTRIES, Outlook
 from mi_neural.estimators import roulette
 
 KINDS = ("learned", "nonsense", "broken")
-#: Divisions (n_cache, n_traced, probability, alpha, roulette).
-SPLITS = {"one": (0, 1, 1.0, 0.0, 0.5), "four": (0, 4, 1.0, 0.0, 0.2), "strong": (0, 1, 1.0, 0.0, 3.0),
-          "with cache": (4, 2, 0.5, 1.0, 0.5)}  # fmt: skip
-KEYS = {"roulette": 0.5}
+#: Divisions (n_cache, n_traced, probability, alpha, roulette, guide).
+SPLITS = {"one": (0, 1, 1.0, 0.0, 0.5, 0.0), "four": (0, 4, 1.0, 0.0, 0.2, 0.0), "strong": (0, 1, 1.0, 0.0, 3.0, 0.0),
+          "guided": (0, 1, 1.0, 0.0, 0.0, 0.5), "both": (0, 2, 1.0, 0.0, 0.5, 0.8),
+          "with cache": (4, 2, 0.5, 1.0, 0.5, 0.3)}  # fmt: skip
+KEYS = {"roulette": 0.5, "guide": 0.5}
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,8 @@ def tell(integrator, kind: str) -> None:
             values = np.where(bad, rng.choice([np.nan, np.inf, -np.inf, -1.0, 0.0], ENTRIES), values)
         setattr(outlook, name, mi.Float(values.astype(np.float32)))
     dr.make_opaque(outlook.ahead, outlook.visible)
+    light = 10 ** rng.uniform(-3, 1, (guides.ENTRIES, guides.N_BINS))
+    outlook.guide = guides.Guide(*outlook.box, light, np.full(guides.ENTRIES, guides.FEW))
 
 
 def check(bench, name, kind, splits, cache="trained", **keys):
@@ -103,6 +107,50 @@ def test_outlook_of_darkness_is_nothing():
     assert np.isfinite(np.array(outlook.ahead)).all() and float(outlook.mean[0]) == 0
 
 
+# ---------------------------------------------------------------- directions
+
+
+@pytest.fixture(scope="module")
+def guide():
+    """A guide of random tables, one entry without light."""
+    light = 10 ** np.random.default_rng(1).uniform(-2, 1, (guides.ENTRIES, guides.N_BINS))
+    light[7] = 0
+    return guides.Guide([0.0] * 3, [1.0] * 3, light, np.full(guides.ENTRIES, guides.FEW))
+
+
+def test_bins_are_those_that_their_directions_came_from():
+    index = dr.arange(mi.UInt32, guides.N_BINS)
+    for u in ((0.01, 0.01), (0.5, 0.5), (0.99, 0.99)):
+        d = guides.direction_in(index, mi.Point2f(*u))
+        assert np.allclose(np.array(dr.norm(d)), 1, atol=1e-5)
+        assert np.array_equal(np.array(guides.bin_of(d)), np.array(index))
+
+
+@pytest.mark.parametrize("cell", [3, 7])
+def test_directions_have_the_density_that_is_said(guide, cell):
+    """E[1/p] over half the sphere is its solid angle, and each bin is met as often as its share."""
+    n = 2**20
+    rng = mi.PCG32(n)
+    d = guide.sample(mi.UInt32(cell), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), True)
+    p = np.array(guide.pdf(mi.UInt32(cell), d, True))
+    met = np.bincount(np.array(guides.bin_of(d)), minlength=guides.N_BINS)
+    shares = np.array(guide.shares).reshape(-1, guides.N_BINS)[cell].astype(np.float64)
+    assert shares.sum() == pytest.approx(1, abs=1e-5)
+    assert ((met - n * shares) ** 2 / (n * shares)).sum() < 400  # chi2 with 287 degrees of freedom: p = 1e-5
+    assert (np.where(np.array(d.y) > 0, 1 / p, 0)).mean() == pytest.approx(2 * np.pi, rel=0.02)
+
+
+def test_guide_of_a_room_looks_at_its_light(bench):
+    """On the floor of the Cornell box, the table has more than the cosine's share in directions that go up."""
+    scene = bench.scene("cornell_box")
+    outlook = Outlook.learn(scene, scene.sensors()[0], None, 1, n_paths=2**14)
+    outlook.learn_guide(scene, scene.sensors()[0], None, 1, n_paths=2**16, times=1)
+    known = np.array(outlook.guide.known) > 0
+    shares = np.array(outlook.guide.shares).reshape(-1, guides.N_BINS)
+    assert known.sum() > 20 and np.allclose(shares.sum(axis=1), 1, atol=1e-4)
+    assert shares[known].max() > 5 / guides.N_BINS
+
+
 # ---------------------------------------------------------------- the mean is that of path
 
 
@@ -122,7 +170,7 @@ def test_mean_in_the_sphere_is_that_of_path(bench, kind):
                          ids=["plain", "ris", "every_vertex", "lights"])  # fmt: skip
 @pytest.mark.parametrize("name", ["lit_cube", "glossy_hall", "lamp_bays"])
 def test_mean_in_more_scenes_by_every_setting(bench, name, keys, kind):
-    names = ("one", "strong", "with cache") if "ris" not in keys else ("one", "strong")
+    names = ("one", "strong", "both", "with cache") if "ris" not in keys else ("one", "strong", "guided")
     check(bench, name, kind, {n: SPLITS[n] for n in names}, **keys)
 
 
@@ -139,10 +187,10 @@ def test_mean_in_well_known_scenes(bench, shared_scenes, name, kind):
 
 
 def test_without_strength_it_is_path_tracing(bench):
-    """Bit for bit the same as with strength 0 given, whatever the outlook."""
+    """Bit for bit the same, whatever the outlook and the guide."""
     scene = bench.scene("cornell_box")
     integrator, _ = bench.integrator("cornell_box", **KEYS)
-    integrator.choice.split = split_of((0, 1, 1.0, 0.0, 0.0))
+    integrator.choice.split = split_of((0, 1, 1.0, 0.0, 0.0, 0.0))
     image = render(scene, integrator)
     tell(integrator, "nonsense")
     assert np.array_equal(image, render(scene, integrator))
@@ -159,19 +207,21 @@ def test_strength_is_measured_with_the_division(bench, monkeypatch):
     render(scene, integrator, 1)
     strengths = {t["roulette"] for t in integrator.measure(scene)["pilot"]}
     assert 0 in strengths and len(strengths) == 4
-    assert integrator.choice.outlook is not None
+    assert {t["guide"] for t in integrator.statistics()["pilot"]} == {0.0, 0.5}
+    assert (integrator.choice.outlook.guide is None) == (integrator.split.guide == 0)
     integrator.reset()
     assert integrator.choice.outlook is None
 
 
-@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
-def test_impossible_strength_is_refused_by_name(value):
-    with pytest.raises((ValueError, RuntimeError), match="nirc_two_level: roulette is"):
-        mi.load_dict({"type": "nirc_two_level", "roulette": value})
+@pytest.mark.parametrize("key, value", [("roulette", -0.1), ("roulette", np.nan), ("roulette", np.inf),
+                                        ("guide", -0.1), ("guide", 1.0), ("guide", np.nan)])  # fmt: skip
+def test_impossible_key_is_refused_by_name(key, value):
+    with pytest.raises((ValueError, RuntimeError), match=f"nirc_two_level: {key} is"):
+        mi.load_dict({"type": "nirc_two_level", key: value})
 
 
 def test_equal_seeds_give_equal_images(bench):
     scene = bench.scene("cornell_box")
-    images = [render(scene, mi.load_dict({"type": "nirc_two_level", "cache_samples": 0, "roulette": 0.5}), seed=3)
+    images = [render(scene, mi.load_dict({"type": "nirc_two_level", "cache_samples": 0, **KEYS}), seed=3)
               for _ in range(2)]  # fmt: skip
     assert np.array_equal(*images)

@@ -15,6 +15,8 @@ from ..render import path as paths
 from ..render import vertex
 from ..render.film import film_rays
 from ..render.sampling import PathSampler
+from . import guide as guides
+from .guide import Guide
 from .voxels import Voxels, main_side
 
 #: Cells along the longest axis of the box of what paths meet, and entries of the table.
@@ -23,6 +25,8 @@ CELLS, ENTRIES = 32, 2**16
 N_PATHS, N_VERTICES = 2**17, 8
 #: Records of the scene's mean that each cell begins with.
 PRIOR = 4.0
+#: Luminance above which a record of the guide counts as this.
+BRIGHTEST = 1e4
 #: The level of a pixel is at least this share of the scene's mean.
 LEVEL_MIN = 0.1
 
@@ -33,16 +37,20 @@ class Outlook:
     ahead    mean luminance that leaves the surfaces of a cell, direct light included
     visible  share of the light samples of a cell that are not shadowed
     mean     mean of `ahead` over all records; 1-wide
+    guide    tables of directions; None: there are none
     """
 
-    DRJIT_STRUCT = {"voxels": object, "ahead": object, "visible": object, "mean": object}  # noqa: RUF012
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "voxels": object, "ahead": object, "visible": object, "mean": object, "guide": object,
+    }  # fmt: skip
+    guide: Guide | None = None
 
     def __init__(self, low=None, high=None):
         if low is None:  # as Dr.Jit makes one
             return
         self.voxels = Voxels(low, high, CELLS)
         self.ahead, self.visible = dr.zeros(mi.Float, ENTRIES), dr.full(mi.Float, 1, ENTRIES)
-        self.mean = mi.Float(0)
+        self.mean, self.guide, self.box = mi.Float(0), None, (low, high)
         dr.make_opaque(self.ahead, self.visible, self.mean)
 
     def entry(self, si):
@@ -69,7 +77,7 @@ class Outlook:
     def learn(cls, scene, sensor, lights, seed: int, n_paths: int = N_PATHS) -> Outlook:
         """An outlook of what `sensor` sees, by path tracing; no other cache is asked."""
         with dr.suspend_grad():
-            records, light = _trace(scene, sensor, lights, seed, n_paths)
+            records, light, _ = _trace(scene, sensor, lights, seed, n_paths)
             p, side, target, valid = records
             points = np.array(p)[:, np.array(valid)]
             if points.shape[1] == 0:
@@ -79,6 +87,22 @@ class Outlook:
             self = cls(low, high)
             self._fill(p, side, target, valid, light)
         return self
+
+    def learn_guide(self, scene, sensor, lights, seed: int, n_paths: int = N_PATHS, times: int = 4) -> None:
+        """See that there is a guide, from so many `times` as many paths."""
+        if self.guide is not None:
+            return
+        found, count = np.zeros(guides.ENTRIES * guides.N_BINS), np.zeros(guides.ENTRIES)
+        voxels = Voxels(*self.box, guides.CELLS)
+        with dr.suspend_grad():
+            for k in range(times):
+                (p, side, _, valid), _, (direction, reflected) = _trace(scene, sensor, lights, seed + k + 1, n_paths)
+                cell = np.array(voxels.entry(p, guides.ENTRIES, side))
+                keep = np.array(valid & (direction < guides.N_BINS) & dr.isfinite(reflected))
+                cell, index, light = (np.array(v)[keep] for v in (cell, direction, reflected))
+                found += np.bincount(cell * guides.N_BINS + index, np.minimum(light, BRIGHTEST), found.size)
+                count += np.bincount(cell, minlength=count.size)
+        self.guide = Guide(*self.box, found.reshape(-1, guides.N_BINS), count)
 
     def _fill(self, p, side, target, valid, light) -> None:
         """Means by cell. Added up in memory order: sums of atomic additions differ from run to run."""
@@ -108,15 +132,16 @@ class _Watched(paths.Surface):
 
 
 def _trace(scene, sensor, lights, seed: int, n: int) -> tuple:
-    """Records of `n` paths: ((position, side of the normal, luminance that leaves, valid), (sampled, arrived))."""
+    """Records of `n` paths: ((position, side of the normal, luminance that leaves, valid), (sampled, arrived), (bin of
+    the direction that was followed, luminance that it brought, times the BSDF over its density))."""
     lane, size = dr.arange(mi.UInt32, n), n * N_VERTICES
     sampler = PathSampler.make(lane, dr.opaque(mi.UInt32, seed & 0xFFFFFFFF))
     ray = film_rays(sensor, sampler.next_2d(), sampler)
     path = paths.start(ray, scene.ray_intersect(ray), mi.Bool(True))
-    zeros = [dr.zeros(mi.Float, size) for _ in range(5)]
-    x, y, z, before, β = zeros
-    facts = dr.zeros(mi.UInt32, size)
-    dr.eval(zeros, facts)
+    zeros = [dr.zeros(mi.Float, size) for _ in range(6)]
+    x, y, z, before, between, β = zeros
+    facts, bins = dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size)
+    dr.eval(zeros, facts, bins)
 
     def step(path, sampler):
         seen = []
@@ -131,17 +156,20 @@ def _trace(scene, sensor, lights, seed: int, n: int) -> tuple:
         k = (path.depth - 1) * n + lane
         bits = [dr.select(b, mi.UInt32(v), 0) for b, v in ((seen[0].sampled, 8), (seen[0].arrived, 16))]
         fact = main_side(vertex.facing(si)) | bits[0] | bits[1]
-        for array, value in ((x, si.p.x), (y, si.p.y), (z, si.p.z), (before, mi.luminance(path.L)),
-                             (β, mi.luminance(path.β)), (facts, fact)):  # fmt: skip
+        L_nee = mi.luminance(path.L + path.β * found.L_nee)
+        index = dr.select(found.delta | ~found.followed, guides.N_BINS, guides.bin_of(found.ray.d))
+        for array, value in ((x, si.p.x), (y, si.p.y), (z, si.p.z), (before, mi.luminance(path.L)), (between, L_nee),
+                             (β, mi.luminance(path.β)), (facts, fact), (bins, index)):  # fmt: skip
             dr.scatter(array, value, k, takes)
         return paths.roulette(paths.advance(path, found), sampler, N_VERTICES)
 
     path, _ = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="paths of an outlook")
     L = mi.luminance(path.L)
-    dr.eval(L, zeros, facts)
+    dr.eval(L, zeros, facts, bins)
     all_L = dr.gather(mi.Float, L, dr.arange(mi.UInt32, size) % n)
     target = dr.maximum((all_L - before) / dr.maximum(β, 1e-9), 0)
     valid = (β > 0) & dr.isfinite(target)
+    reflected = dr.maximum((all_L - between) / dr.maximum(β, 1e-9), 0)
     p = mi.Point3f(x, y, z)
-    dr.eval(p, target, valid)
-    return (p, facts & 7, target, valid), ((facts & 8) > 0, (facts & 16) > 0)
+    dr.eval(p, target, valid, reflected)
+    return (p, facts & 7, target, valid), ((facts & 8) > 0, (facts & 16) > 0), (bins, reflected)

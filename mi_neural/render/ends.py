@@ -14,10 +14,11 @@ class Ends:
     """Where paths end: with which probability they go on, and a shadow ray is traced.
 
     By the throughput from the camera, as in ``path``; where `strength` is positive by the radiance that an `outlook`
-    expects, relative to that of the first vertex, where `first` stands.
+    expects, relative to that of the first vertex, where `first` stands. `share`: of directions, from its guide.
     """
 
-    def __init__(self, outlook, strength, first, rr_depth: int):
+    def __init__(self, outlook, strength, share, first, rr_depth: int):
+        self.share = share
         self.outlook, self.strength, self.rr_depth, self.β_first = outlook, strength, rr_depth, first.β
         if outlook is None:
             self.direct = None
@@ -34,6 +35,12 @@ class Ends:
         expected = mi.luminance(path.β) * self.outlook.ahead_at(path.si, smooth)
         least = roulette.least_of(dr.max(path.β))
         return dr.select(smooth, roulette.survival(expected, self.level, self.strength, least), plain)
+
+    def bsdf(self, path):
+        """The BSDF where a path stands, with directions from the guide."""
+        bsdf = path.si.bsdf(path.ray)
+        guide = None if self.outlook is None else self.outlook.guide
+        return bsdf if guide is None else guide.guided(bsdf, path.si, self.share, path.active)
 
     def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
         """Direct light, shadow rays being left out by chance where little light is expected to arrive."""
