@@ -76,8 +76,11 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
 
     @property
     def bound_field(self):
-        field = super().bound_field
-        return Foreseen(field, self.choice.outlook or Outlook.blank()) if self.choice.may_foresee else field
+        """The cache, with an outlook where the division in use needs one: path tracing has a kernel of its own."""
+        field, split = super().bound_field, self.split
+        if split.roulette == 0 and split.guide == 0:
+            return field
+        return Foreseen(field, (self.choice.outlook or Outlook.blank()).view(split.guide > 0))
 
     @property
     def trains(self) -> bool:

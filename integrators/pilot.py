@@ -239,7 +239,6 @@ class Choice:
         if self.given["guide"] is None:
             self.split = replace(self.split_of(min(tried, key=lambda t: t["cost"])), guide=GUIDED)
             self.look_ahead(pilot.integrator, pilot.scene, pilot.sensor)
-            pilot.run(self.split, passes=1)  # kernels
             self.table.append(pilot.facts(self.split))
 
     @staticmethod
@@ -271,12 +270,13 @@ class Pilot:
         bands = BANDS if area.height >= BANDS else 1
         self.first = [int((k + 0.5) * area.height / BANDS - self.rows / 2) for k in range(bands)]
         self.spp = max(1, min(16, PILOT_SAMPLES // (area.width * self.rows * bands)))
-        self.level = None
+        self.level, self.compiled = None, {(False, False)}  # the first is compiled by whoever measures
         self.samples = area.width * self.rows * self.spp * bands
 
     def run(self, split: Split, passes: int = PILOT_PASSES, first_seed: int = 0):
         """(luminance by pass and pixel, seconds of each pass)."""
-        images, seconds = [], []
+        images, seconds, choice = [], [], self.integrator.choice
+        before, choice.split = choice.split, split  # what is bound depends on it
         for k in range(first_seed * passes, (first_seed + 1) * passes):
             t0 = work_seconds()
             bands = []
@@ -288,6 +288,7 @@ class Pilot:
             dr.eval(bands)
             seconds.append(work_seconds() - t0)
             images.append(np.concatenate([np.array(b) for b in bands]))
+        choice.split = before
         return np.stack(images).astype(np.float64), seconds  # squares of what is dim are 0 in single precision
 
     def _level(self, mean):
@@ -301,6 +302,10 @@ class Pilot:
 
     def facts(self, split: Split, first_seed: int = 0) -> dict:
         """A division with its mean relative variance of one camera sample, seconds a sample, and their product."""
+        kind = split.roulette > 0, split.guide > 0
+        if kind not in self.compiled:
+            self.run(split, passes=1)
+            self.compiled.add(kind)
         images, seconds = self.run(split, first_seed=first_seed)
         if self.level is None:
             self.level = self._level(images.mean(axis=0))

@@ -7,6 +7,8 @@ look-up; roulette keeps its mean whatever it is told.
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -72,6 +74,14 @@ class Outlook:
     def blank(cls) -> Outlook:
         """One that knows nothing, in the place of one that is not needed yet."""
         return cls([0.0] * 3, [1.0] * 3)
+
+    def view(self, guided: bool) -> Outlook:
+        """This, without its guide where it is not `guided`."""
+        if guided or self.guide is None:
+            return self
+        other = copy(self)
+        other.guide = None
+        return other
 
     @classmethod
     def learn(cls, scene, sensor, lights, seed: int, n_paths: int = N_PATHS) -> Outlook:
