@@ -3,7 +3,8 @@
 Independent images of a few samples a pixel are rendered in turn by each integrator, so that a change in the machine's
 load affects all of them. The variance is that of one camera sample, relative to the squared luminance of its pixel as
 in relMSE, averaged over pixels and channels, plain and without the largest 0.1 %; the time is the median of the render
-calls, over their samples. Integrators that learn are trained before. The first integrator has efficiency 1.
+calls, over their samples: on a CPU the seconds of its cores, which other programs change little. Integrators that learn
+are trained before. The first integrator has efficiency 1.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from mi_neural.bench import budget, environment, load, terminal
 from mi_neural.image import exr
 from mi_neural.image.metrics import TRIM_FRACTION
+from mi_neural.render.kernels import work_seconds
 
 #: Added to the squared luminance of a pixel, over the squared mean luminance: as in relMSE.
 EPSILON = 1e-2
@@ -48,9 +50,9 @@ def measure(scene, integrators: dict, spp: int, rounds: int, frames: int) -> lis
     seconds: dict[str, list] = {label: [] for label in integrators}
     for k in range(rounds):
         for label, integrator in integrators.items():
-            start = budget.clock()
+            start = work_seconds()
             image = budget.render_pass(scene, integrator, spp, budget.pass_seed(0, budget.STREAM_IMAGE, k))
-            seconds[label].append(budget.clock() - start)
+            seconds[label].append(work_seconds() - start)
             images[label].append(image[..., :3])
     rows: list[dict] = []
     for label, integrator in integrators.items():

@@ -7,6 +7,8 @@ the values on their way through memory cost it 5 % (manual, speed).
 
 from __future__ import annotations
 
+import time
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,3 +26,10 @@ def end_kernel(*values) -> None:
     """
     if on_gpu() and not dr.flag(dr.JitFlag.SymbolicScope):
         dr.eval(*values)
+
+
+def work_seconds() -> float:
+    """Seconds to compare work by, after all of it is done: those of the processors where they do it, so that other
+    programs count less; on a GPU those of the clock."""
+    dr.sync_thread()
+    return time.perf_counter() if on_gpu() else time.process_time()

@@ -118,6 +118,8 @@ class MediumBounce(paths.Bounce):
 class Place:
     """In the place of :class:`.path.Surface`: a surface in a scene with media, or a point in a medium."""
 
+    untested = False
+
     def __init__(self, media: Media, path: MediumPath, it, bsdf, phase, receiver: tuple, last: Scattering):
         self.media, self.path, self.it, self.bsdf, self.phase, self.last = media, path, it, bsdf, phase, last
         self.received, self.around, self.in_full = receiver, path.scattered, last.in_full

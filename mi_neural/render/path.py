@@ -195,9 +195,10 @@ class Surface:
     origin   where the last scattering was, from which light samples compete with what the path met
     in_full  whether emission that the path met counts in full, as no light sample finds it
     around   whether it receives light from all directions alike; None: nowhere
+    untested whether shadow rays are left to `light_arriving`, the scene's own light samples included
     """
 
-    around = None
+    around, untested = None, False
 
     def __init__(self, path: PathState, bsdf, found: Bounce):
         self.it = self.origin = path.si
@@ -304,7 +305,8 @@ def _light_sample(scene, lights, here, active, hit: _Hit, u, point, sampler, n_l
     """One of `n_lights` light samples: (what it gives, how its light was chosen, sampler)."""
     smooth, choice = active & here.is_smooth(), None
     if lights is None:
-        ds, light = scene.sample_emitter_direction(here.it, point, here.around is None, smooth)
+        tests = here.around is None and not here.untested
+        ds, light = scene.sample_emitter_direction(here.it, point, tests, smooth)
         pdf_light, sampled = ds.pdf, smooth & (ds.pdf > 0)
     else:
         n, transmits = here.received
@@ -367,13 +369,13 @@ def survival(path: PathState, rr_depth: int, share=1, most=0.95):
     return dr.select(path.depth > rr_depth, q, 1)
 
 
-def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None, most=0.95) -> tuple:
+def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None, most=0.95, q=None) -> tuple:
     """(the path, which may have ended, throughput divided by the probability that it has not; sampler).
 
     E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together. `share`, `most`: of
-    :func:`survival`.
+    :func:`survival`; `q`: in place of it.
     """
-    q = survival(path, rr_depth, share, most)
+    q = survival(path, rr_depth, share, most) if q is None else q
     u = sampler.next_1d() if u is None else u
     alive = path.active & (u < q) & (dr.max(path.β) > 0)
     return replace(path, β=path.β * dr.rcp(dr.maximum(q, 1e-6)), active=alive), sampler
