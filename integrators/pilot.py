@@ -282,7 +282,8 @@ class Pilot:
                 bands = []
                 for y in self.first:
                     _, values = self.integrator.render_rows(
-                        self.scene, self.sensor, 0x9107 + k, (self.rows, self.spp), y, settings=split.numbers(), sums=True
+                        self.scene, self.sensor, 0x9107 + k, (self.rows, self.spp), y, settings=split.numbers(),
+                        sums=True,
                     )
                     bands.append(mi.luminance(mi.Color3f(*values[:3])) / self.spp)
                 dr.eval(bands)
