@@ -120,11 +120,16 @@ def fluence(scene, table, p, n: int, seed: int = 0) -> tuple:
     reach = np.linalg.norm(c["center"] - center, axis=1).max() + c["radius"].max()
     to = mi.Vector3f(*(center - np.asarray(p)).tolist())
     distance = float(dr.norm(to)[0])
-    cos_max = -1.0 if distance <= reach * 1.01 else float(np.sqrt(1 - (1.01 * reach / distance) ** 2))
+    # A cone around the lamp, by 1 - cos: the cosine of a narrow one is 1 in single precision
+    sin_max = 1.01 * reach / distance if distance > 1.01 * reach else np.inf
+    opening = float(sin_max**2 / (1 + np.sqrt(1 - sin_max**2))) if sin_max < 1 else 2.0
     numbers, si = uniforms(n, seed), place(p, n)
     frame = mi.Frame3f(dr.normalize(to) if distance > 0 else mi.Vector3f(0, 0, 1))
-    d = frame.to_world(mi.warp.square_to_uniform_cone(numbers.next_2d(), cos_max))
-    pdf_ray = 1 / (2 * np.pi * (1 - cos_max))
+    u = numbers.next_2d()
+    below, (sin_phi, cos_phi) = opening * u.x, dr.sincos(dr.two_pi * u.y)
+    sin = dr.sqrt(below * (2 - below))
+    d = frame.to_world(mi.Vector3f(cos_phi * sin, sin_phi * sin, 1 - below))
+    pdf_ray = 1 / (2 * np.pi * opening)
     met = scene.ray_intersect(mi.Ray3f(si.p, d))
     index, emits = table.index_of(scene, met)
     Le = dr.select(emits, met.emitter(scene).eval(met), 0)
@@ -136,7 +141,8 @@ def fluence(scene, table, p, n: int, seed: int = 0) -> tuple:
     ds, weight, pdf_light = table.sample(scene, si, light, numbers.next_2d(), mi.Bool(True))
     seen = (pdf_light > 0) & ~scene.ray_test(si.spawn_ray_to(ds.p))
     pdf_light /= table.n_lights
-    in_cone = dr.dot(ds.d, frame.n) >= cos_max
+    away = dr.norm(dr.cross(ds.d, frame.n))
+    in_cone = mi.Bool(sin_max == np.inf) | (dr.dot(ds.d, frame.n) > 0) & (away <= float(sin_max))
     grey = lambda v: np.array(dr.mean(v) + dr.zeros(mi.Float, n), np.float64)  # noqa: E731
     rays = grey(Le / pdf_ray)
     lights = grey(dr.select(seen, weight * table.n_lights, 0))
