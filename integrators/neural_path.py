@@ -17,30 +17,31 @@ from mi_neural.render.surface import scene_is_glossy
 
 #: Queries a camera sample, at its first surface and at its end.
 QUERIES = 2.0
-#: A denoiser removes as much noise as so many times the samples.
-DENOISED_SAMPLES = 100
+#: A denoiser removes as much noise as so many times the samples, and its images of few samples have the least FLIP with
+#: this spread threshold (manual, measured).
+DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
 #: Share of its training paths that run on without self-training. Of a denoised image of 32 samples, FLIP over that with
 #: a quarter: veach-bidir 0.89, veach-ajar, living room and staircase 0.99, Cornell box 1.04 (manual, measured).
 DENOISED_UNBOUNDED = 0.5
-#: Squared relative bias b² of the cache from which on the spread threshold of an image that will be denoised is the
-#: largest.
-LARGE_BIAS = 0.04
+#: Ratio b²/v from which on the spread threshold of an image that will be denoised is the largest.
+LARGE_RATIO = 0.02
 
 
-def denoised_threshold(bias, spp):
-    """Spread threshold of an image of `spp` samples that will be denoised: ``N^(1/4) / 2 min(1, (b² / 0.04)²)``.
+def denoised_threshold(ratio, spp):
+    """Spread threshold of an image of `spp` samples that will be denoised: ``sqrt(spp) min(1, (ratio / 0.02)²)``.
 
-    `bias` is b², the squared bias of the cache over its squared answer, a mean over the scene. Form and numbers fit the
-    least error in equal time among thresholds of 0.01, 0.1, 1 and 8, in five scenes, with 4 to 256 samples, after 80
-    and 300 training steps (manual, measured; studies/spread_threshold.py).
+    `ratio` is b²/v, the cache's squared bias over the noise of tracing on. Form and number fit the best of up to
+    five thresholds (1 to 100) in six scenes, with 4, 16 and 64 samples (studies/spread_threshold.py).
     """
-    return 0.5 * dr.sqrt(dr.sqrt(spp)) * dr.minimum(1, dr.square(bias / LARGE_BIAS))
+    return dr.sqrt(spp) * dr.minimum(1, dr.square(ratio / LARGE_RATIO))
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
     def __init__(self, props):
         super().__init__(props)
         self.denoised = props.get("denoised", False)
+        if self.denoised and "spread_threshold" not in props:
+            self.spread_threshold = DENOISED_THRESHOLD
         self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; neural_path needs 'ema'")
         n = self.cache.training.n_paths
         self._check(n > 1, f"train_samples is {n}; training paths come in pairs, at least 2")
@@ -75,7 +76,7 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         n_samples, threshold = settings
         cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
         if cached and self.denoised:
-            threshold = dr.maximum(threshold, denoised_threshold(field.grid.mean_bias, n_samples / DENOISED_SAMPLES))
+            threshold = dr.maximum(threshold, denoised_threshold(field.grid.ratio, n_samples / DENOISED_SAMPLES))
 
         def stop(path, spread, smooth, first, sampler):
             share = field.grid.share(*self.walk.place(path), n_samples, smooth)
@@ -147,8 +148,8 @@ NeuralPathIntegrator.__doc__ = (
 
      * - denoised
        - |bool|
-       - The image will be denoised: noise counts as in 100 times as many samples, and ``spread_threshold`` is raised to
-         :math:`N^{1/4}/2 \min(1, (b^2/0.04)^2)` where that is more, b² being relative and the mean of the scene.
+       - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and it
+         is raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` where that is more, b²/v being the mean of the scene.
          (Default: false)
      * - spread_threshold
        - |float|

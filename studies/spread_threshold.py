@@ -48,10 +48,10 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     ours, _ = load.build_integrator(load.parse_integrator("neural_path:denoised=true"), {"max_depth": max_depth})
     budget.train(loaded.scene, ours, frames)
     ours.freeze_cache = True
-    bias, spps = ours.cache.queried.grid.mean_bias[0], [int(n) for n in spp.split(",")]
+    ratio, spps = ours.cache.queried.grid.ratio[0], [int(n) for n in spp.split(",")]
     ours.denoised = False  # or it would raise the thresholds by what it has measured
     for samples in spps:
-        print(f"{loaded.name}, {samples} spp: neural_path takes c = {max(0.01, denoised_threshold(bias, samples)):.2f}")
+        print(f"{loaded.name}, {samples} spp: neural_path takes c = {max(1.0, denoised_threshold(ratio, samples)):.1f}")
         line("path", path, samples)
         for c in map(float, thresholds.split(",")):
             ours.settings = lambda n, c=c: (n * DENOISED_SAMPLES, c)
