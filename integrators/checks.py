@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural import parameters
-from mi_neural.render.kernels import on_gpu
 from mi_neural.render.media import has_instances, media_of
 
 #: Most entries of an array: Dr.Jit counts them in 32 bits.
@@ -51,21 +50,6 @@ def refuse_medium_of(sensor, plugin: str) -> None:
     """Refuse a sensor that is inside a participating medium."""
     if hasattr(sensor, "get_medium") and sensor.get_medium() is not None:
         raise ValueError(f"{plugin}: the camera is inside a participating medium, and {WITH_MEDIA}")
-
-
-def environment_among_lights_on_gpu(scene) -> bool:
-    """Whether a light sampler would end the process: Dr.Jit 1.5.0 did so on an H100 ("jit_var(r0): unknown variable")
-    where one chose among an environment map and other lights."""
-    return on_gpu() and scene.environment() is not None and len(scene.emitters()) > 1
-
-
-def check_lights_on_gpu(scene, plugin: str, advice: str = "leave out its light_sampler") -> None:
-    """Refuse to choose among an environment map and other lights on a GPU."""
-    if environment_among_lights_on_gpu(scene):
-        raise ValueError(
-            f"{plugin}: on a GPU no light sampler works in a scene with an environment map together with other lights; "
-            f"{advice}, or type mi.set_variant('llvm_ad_rgb')"
-        )
 
 
 def check_phase_functions(scene, sensor, plugin: str) -> None:

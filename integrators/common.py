@@ -15,7 +15,7 @@ from mi_neural import plan
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.files import damaged
 from mi_neural.integrators import gradients, planning
-from mi_neural.integrators.checks import FILM_VALUES, check_lights_on_gpu, check_scene
+from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.learning import LearningIntegrator
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import BoundScene
@@ -174,7 +174,6 @@ class CacheIntegrator(LearningIntegrator):
                 self.state.bound.parts = known
                 raise
         if self.light_sampler is not None:
-            check_lights_on_gpu(scene, self.plugin)
             # Settings are measured with lights chosen as they will be; an image rendered in several calls is one frame
             learn = (train and not self.state.image_open) or not self.state.measured
             with dr.suspend_grad():

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.integrators.base import FilmIntegrator
-from mi_neural.integrators.checks import check_lights_on_gpu, check_scene, sensor_of
+from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
@@ -54,7 +54,6 @@ class LightSamplingIntegrator(FilmIntegrator):
             self.bound.changed(scene)
         self.film_state.n_bound += 1
         if self.light_sampler is not None:
-            check_lights_on_gpu(scene, self.plugin)
             self.lights = self.light_sampler.lights(scene, recordable(sensor, self.film_state.n_bound), train)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):

@@ -9,7 +9,7 @@ from mi_neural.estimators import reservoir
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import refuse_gradients
-from mi_neural.integrators.checks import check_film, check_lights_on_gpu, check_scene, refuse_medium_of, sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.integrators.restir_past import Past, alike, camera_of, nothing, reproject, slim_surface
@@ -276,7 +276,6 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def _lights(self, scene, sensor):
         """See that `state.power` is that of the scene now. Returns what chooses the candidates, and what a recorded
         function takes for granted of it."""
-        check_lights_on_gpu(scene, self.plugin, "take neural_path without a light_sampler")
         s = self.state
         if s.chooser is None:
             s.chooser = self.light_sampler or mi.load_dict(

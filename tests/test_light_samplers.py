@@ -238,13 +238,21 @@ def nirc(name, **keys):
 ])  # fmt: skip
 def test_environment_map_among_lights_is_refused_on_a_gpu_and_not_planned(monkeypatch, keys):
     """There Dr.Jit 1.5.0 ends the process, also where the plan would choose a light sampler."""
-    monkeypatch.setattr("mi_neural.integrators.checks.on_gpu", lambda: True)
+    monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
     scene, cheap = test_scene(many("kinds", None), 4), {} if keys["type"] == "plain_path" else {"train_samples": 64}
-    with pytest.raises(ValueError, match="environment map together with other lights; leave out its light_sampler"):
+    with pytest.raises(ValueError, match=r"power_lights: on a GPU .* environment map together with other lights"):
         mi.load_dict({**keys, **cheap, "light_sampler": SAMPLERS["power"]}).render(scene, spp=1)
     integrator = mi.load_dict({**keys, **cheap, "max_depth": 3})
     assert np.isfinite(np.array(integrator.render(scene, spp=1))).all()
     assert integrator.light_sampler is None
+
+
+def test_integrators_that_always_choose_lights_refuse_an_environment_map_among_them_on_a_gpu(monkeypatch):
+    monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
+    scene = test_scene(many("kinds", None), 4)
+    for type_ in ("nvc_direct", "restir_di"):
+        with pytest.raises(ValueError, match=r"on a GPU .* environment map together with other lights"):
+            mi.load_dict({"type": type_}).render(scene, spp=1)
 
 
 @pytest.mark.parametrize("name, depth", [("power", 2), ("tree", 4), ("clusters", 2), ("trained", 4)])

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..render.kernels import on_gpu
 from ..render.spectrum import is_rgb
 from .entries import (
     CYLINDER,
@@ -41,6 +42,12 @@ from .entries import (
 MAX_LIGHTS = 2**24
 #: Shadow rays end this share of their length before the light, so that the light itself is not in the way.
 SHADOW_EPSILON = 1e-3
+
+
+def ends_the_process(scene) -> bool:
+    """Whether a choice among the lights of `scene` ends the process: on a GPU, where there is an environment map
+    together with other lights. Dr.Jit 1.5.0 did so on an H100 ("jit_var(r0): unknown variable")."""
+    return on_gpu() and scene.environment() is not None and len(scene.emitters()) > 1
 
 
 class LightTable:
