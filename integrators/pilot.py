@@ -114,11 +114,6 @@ class Choice:
         return self.given["alpha"] != 0 and self.given["n_cache"] != 0
 
     @property
-    def may_foresee(self) -> bool:
-        """Whether a division could have paths end by what lies ahead."""
-        return self.given["roulette"] != 0 or self.given["guide"] != 0
-
-    @property
     def must_look_ahead(self) -> bool:
         """Whether the division in use needs what is not known yet."""
         looks, guided = self.split.roulette > 0 or self.split.guide > 0, self.split.guide > 0

@@ -131,14 +131,12 @@ class Outlook:
 class _Watched(paths.Surface):
     """A surface that notes which light samples could arrive, and which did."""
 
-    sampled = arrived = None
+    untested, sampled, arrived = True, None, None
 
     def light_arriving(self, scene, tested, ds, light, f, sampled, sampler):
         self.sampled = sampled & (dr.max(f * light) > 0)
         self.arrived = self.sampled & ~scene.ray_test(self.it.spawn_ray_to(ds.p), self.sampled)
         return light, self.arrived, sampler
-
-    untested = True
 
 
 def _trace(scene, sensor, lights, seed: int, n: int) -> tuple:
