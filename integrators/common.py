@@ -70,6 +70,7 @@ class _State:
         self.images = 0
         self.queries = 0.0
         self.image_open = False
+        self.hurried = False  # whether the time for training was too short for a cache that is of use
 
 
 class CacheIntegrator(LearningIntegrator):

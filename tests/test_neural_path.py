@@ -21,7 +21,7 @@ from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
 from mi_neural.estimators.spread import grown
-from mi_neural.integrators.neural_path import DENOISED_SAMPLES, denoised_threshold
+from mi_neural.integrators.neural_path import DENOISED_SAMPLES, LEAST_STEPS, denoised_threshold
 from mi_neural.render.kernels import on_gpu
 
 SLOW = pytest.mark.slow
@@ -399,3 +399,33 @@ def test_impossible_combination_is_refused(keys, message):
 def test_unknown_termination_is_refused(plugin):
     with pytest.raises((ValueError, RuntimeError), match="termination"):
         mi.load_dict({"type": plugin, "termination": "sometimes"})
+
+
+def test_a_cache_with_no_time_to_learn_stays_out_of_the_image(box, monkeypatch):
+    """Where the seconds for training are too few for LEAST_STEPS, the image is traced; the cache goes on learning."""
+    integrator = auto(channels="cached, share", denoised=True)
+    integrator.train(box, 0)
+    facts = integrator.train_seconds(box, 1e-6)
+    assert facts["cache_left_out"] and integrator.cache.steps < LEAST_STEPS
+    image = render(box, integrator)
+    assert np.abs(image[..., 3:]).max() == 0 and image[..., :3].mean() > 0
+    integrator.train(box, LEAST_STEPS - integrator.cache.steps)
+    assert "cache_left_out" not in integrator.statistics()
+    assert render(box, integrator)[..., 3:6].max() > 0
+    integrator.reset()
+    integrator.train(box, 3)  # who asks for three steps gets an image of three
+    assert render(box, integrator)[..., 3:6].max() > 0
+
+
+def test_a_training_by_time_is_prolonged_for_the_least_steps(box, monkeypatch):
+    integrator = auto()
+    integrator.prepare(box, spp=1)
+    seconds = []
+    monkeypatch.setattr(type(integrator), "seconds_of_step", lambda self, *_: seconds[0])
+    seconds.append(0.01)
+    integrator.train_seconds(box, 0.2)  # 24 steps of 0.01 s are 1.2 times the time
+    assert integrator.cache.steps >= LEAST_STEPS
+    integrator.reset()
+    seconds[0] = 0.1
+    facts = integrator.train_seconds(box, 0.2)
+    assert facts["cache_left_out"] and integrator.cache.steps < LEAST_STEPS
