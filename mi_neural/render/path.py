@@ -260,16 +260,18 @@ def direct_light(
 
 def several_lights(
     n_lights: int, scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None,
+    here=None,
 ):  # fmt: skip
-    """As :func:`direct_light` at a surface without media, by the mean of `n_lights` light samples against one BSDF ray.
+    """As :func:`direct_light`, by the mean of `n_lights` light samples against one BSDF ray.
 
     What the choice of a light needs to know of the surface, a query of a network included, is found once. The light
     samples have stratified numbers in place of `numbers`.
     """
-    here = Surface(path, bsdf, found)
+    here = here or Surface(path, bsdf, found)
+    in_media = {} if here.around is None else {"around": here.around}
     hit = _light_hit(scene, lights, here, found)
     if hasattr(lights, "remembering"):
-        lights = lights.remembering(here.it, *here.received, several=True)
+        lights = lights.remembering(here.it, *here.received, several=True, **in_media)
     active = path.active & here.is_smooth()
 
     def one(i, total, sampler):
@@ -281,7 +283,7 @@ def several_lights(
         (mi.UInt32(0), mi.Spectrum(0), sampler), lambda i, *_: active & (i < n_lights), one, label="light samples"
     )
     weighed = hit.emits & ~here.in_full
-    pmf_hit = None if lights is None else lights.pmf(here.it, *here.received, hit.index, weighed)
+    pmf_hit = None if lights is None else lights.pmf(here.it, *here.received, hit.index, weighed, **in_media)
     return L_nee / n_lights, _light_met(scene, lights, here, found, hit, pmf_hit, n_lights), sampler
 
 
