@@ -18,7 +18,6 @@ homogeneous media, and estimated by ratio tracking in others (Novák et al. 2014
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -235,10 +234,9 @@ class Media:
         )  # fmt: skip
         return self._arrive(path, limit), sampler
 
-    def bounce(self, integrator, scene, lights, path: MediumPath, sampler, numbers=None, n_lights: int = 1) -> tuple:
+    def bounce(self, integrator, scene, lights, path: MediumPath, sampler, numbers=None) -> tuple:
         """Sample a direction where `path` stands, by BSDF or phase function, follow it to the next vertex, and find
-        direct light, by the mean of `n_lights` light samples. Returns (:class:`MediumBounce`, sampler). `numbers`: in
-        place of the sampler's own."""
+        direct light. Returns (:class:`MediumBounce`, sampler). `numbers`: in place of the sampler's own."""
         if numbers is None:
             numbers, sampler = paths.draw_numbers(sampler)
         si, active, in_medium = path.si, path.active, path.active & path.scattered
@@ -274,8 +272,7 @@ class Media:
             mi.Spectrum(0), mi.Spectrum(0), end, null, followed, last,
         )  # fmt: skip
         place = Place(self, path, it, bsdf, phase, receiver, last)
-        direct = paths.direct_light if n_lights == 1 else partial(paths.several_lights, n_lights)
-        found.L_nee, found.Le, sampler = direct(
+        found.L_nee, found.Le, sampler = paths.direct_light(
             scene, lights, replace(path, active=deeper), bsdf, found, numbers, sampler, here=place
         )
         return found, sampler

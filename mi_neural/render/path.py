@@ -16,7 +16,7 @@ for `valid` (alpha), null surfaces, ``hide_emitters``, ``rr_depth`` and ``max_de
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import drjit as dr
@@ -150,6 +150,11 @@ def stratified(sampler, n=1, i=0) -> Numbers:
     )  # fmt: skip
 
 
+def choose_numbers(mask, a: Numbers, b: Numbers) -> Numbers:
+    """The numbers `a` where the mask says so, else `b`."""
+    return Numbers(*(dr.select(mask, getattr(a, f.name), getattr(b, f.name)) for f in fields(Numbers)))
+
+
 def sample_bsdf(si, bsdf, lobe, direction, active) -> tuple:
     """A direction by a BSDF, from uniform numbers: (BSDF sample, ``f cos / p``, whether a mirror lobe was sampled)."""
     bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, direction, active)
@@ -260,18 +265,16 @@ def direct_light(
 
 def several_lights(
     n_lights: int, scene, lights, path: PathState, bsdf, found: Bounce, numbers: Numbers, sampler, alone=None,
-    here=None,
 ):  # fmt: skip
-    """As :func:`direct_light`, by the mean of `n_lights` light samples against one BSDF ray.
+    """As :func:`direct_light` at a surface without media, by the mean of `n_lights` light samples against one BSDF ray.
 
     What the choice of a light needs to know of the surface, a query of a network included, is found once. The light
     samples have stratified numbers in place of `numbers`.
     """
-    here = here or Surface(path, bsdf, found)
-    in_media = {} if here.around is None else {"around": here.around}
+    here = Surface(path, bsdf, found)
     hit = _light_hit(scene, lights, here, found)
     if hasattr(lights, "remembering"):
-        lights = lights.remembering(here.it, *here.received, several=True, **in_media)
+        lights = lights.remembering(here.it, *here.received, several=True)
     active = path.active & here.is_smooth()
 
     def one(i, total, sampler):
@@ -283,7 +286,7 @@ def several_lights(
         (mi.UInt32(0), mi.Spectrum(0), sampler), lambda i, *_: active & (i < n_lights), one, label="light samples"
     )
     weighed = hit.emits & ~here.in_full
-    pmf_hit = None if lights is None else lights.pmf(here.it, *here.received, hit.index, weighed, **in_media)
+    pmf_hit = None if lights is None else lights.pmf(here.it, *here.received, hit.index, weighed)
     return L_nee / n_lights, _light_met(scene, lights, here, found, hit, pmf_hit, n_lights), sampler
 
 
