@@ -80,6 +80,7 @@ def measure(scene, names: list[str], spp: int, repeats: int) -> list[dict]:
         took = float(np.median(seconds[name]) / spp)
         records.append({
             "method": name, "variance": float(variance.mean()), "seconds_sample": took,
+            "milliseconds": 1000 * took,
             "trimmed": float(np.sort(variance)[: int(0.99 * variance.size)].mean()),
             "seconds_train": max(0.0, training[name] - took * spp), "mean": float(np.mean(images[name])),
             "nonfinite": int((~np.isfinite(images[name])).sum()),
