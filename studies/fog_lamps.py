@@ -79,7 +79,7 @@ def measure(scene, names: list[str], spp: int, repeats: int) -> list[dict]:
         variance = spp * (np.var(images[name], axis=0, ddof=1) / (mean**2 + 0.01 * mean.mean() ** 2)).mean(-1).ravel()
         took = float(np.median(seconds[name]) / spp)
         records.append({
-            "method": name, "variance": float(variance.mean()), "seconds_sample": took,
+            "label": name, "variance": float(variance.mean()), "seconds_sample": took,
             "milliseconds": 1000 * took,
             "trimmed": float(np.sort(variance)[: int(0.99 * variance.size)].mean()),
             "seconds_train": max(0.0, training[name] - took * spp), "mean": float(np.mean(images[name])),

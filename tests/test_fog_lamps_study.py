@@ -25,5 +25,5 @@ def test_records_of_the_study(tmp_path):
     study.main(["--lamps", "4", "--method", "tree_lights", "--size", "8", "8", "--spp", "4", "--repeats", "3",
                 "-o", str(tmp_path)])  # fmt: skip
     records = json.loads((tmp_path / "fog_lamps.json").read_text())["methods"]
-    assert [r["method"] for r in records] == ["volpath", "tree_lights"]
+    assert [r["label"] for r in records] == ["volpath", "tree_lights"]
     assert records[0]["gain_trimmed"] == 1 and all(r["nonfinite"] == 0 and r["variance"] > 0 for r in records)
