@@ -2,12 +2,14 @@
 
 from dataclasses import asdict, dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 
 from mi_neural.caches import presets
 from mi_neural.caches.visibility import GRID, LOSSES, VisibilityCache, VisibilityTraining
 from mi_neural.emitters.common import LightSampler
 from mi_neural.lights import clusters
+from mi_neural.lights.cells import CellLights
 from mi_neural.lights.sampling import VISIBILITY_FLOOR, VisibleLights
 
 
@@ -44,6 +46,8 @@ class Paper(Constants):
         return replace(self, **asdict(presets.ClusteredVisibility()))
 
 
+#: How lights are chosen in media.
+IN_MEDIA = ("cells", "network")
 PRESETS = {"measured": Constants(), "paper": Paper(**asdict(presets.NeuralVisibility()))}
 
 
@@ -86,6 +90,11 @@ class NVCLightSampler(LightSampler):
      * - candidates
        - |int|
        - Lights of a cluster that one is resampled from. (Default: 16)
+     * - in_media
+       - |string|
+       - How lights are chosen in scenes with participating media, where each has an output of its own. ``cells``: by a
+         table of the weights above in cells of the scene, made anew after 16 training steps. ``network``: by the
+         weights at the point itself, which takes longer. (Default: cells)
      * - visibility
        - |bool|
        - Use the network. false: choose by unshadowed light alone, nothing is trained. (Default: true)
@@ -191,13 +200,14 @@ class NVCLightSampler(LightSampler):
     """
 
     def __init__(self, props):
-        self.cache, self.begun = None, False
+        self.cache, self.begun, self.cells = None, False, None
         self.outputs = props.get("outputs", 32)
         self.clusters = props.get("clusters", "auto")
         self.environment_cells = props.get("environment_cells", 0)
         keys = ("outputs", "clusters", "environment_cells", "visibility")
         self.fixed = {key: props[key] for key in keys if key in props}
         self.candidates = props.get("candidates", 16)
+        self.in_media = props.get("in_media", "cells")
         self.visibility = props.get("visibility", True)
         self.train_steps = props.get("train_steps", 1)
         self.freeze = props.get("freeze", False)
@@ -210,6 +220,8 @@ class NVCLightSampler(LightSampler):
         self._check(0 <= self.environment_cells <= 256,
                     f"environment_cells is {self.environment_cells}; it must lie in 0..256")  # fmt: skip
         self._check(self.candidates >= 1, f"candidates is {self.candidates}; it must be at least 1")
+        self._check(self.in_media in IN_MEDIA,
+                    f"in_media is '{self.in_media}'; give one of: {', '.join(IN_MEDIA)}")  # fmt: skip
         self._check(self.train_frames >= 0, f"train_frames is {self.train_frames}; it must be 0 or more")
         self._check(self.train_steps >= 0, f"train_steps is {self.train_steps}; it must be 0 or more")
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
@@ -258,7 +270,7 @@ class NVCLightSampler(LightSampler):
         return VisibilityCache(training, seed=self.seed, grid=grid, he=c.init == "he")
 
     def reset(self) -> None:
-        self.begun = False
+        self.begun, self.cells = False, None
         if self.cache is not None:
             self.cache.reset()
         if self.sampler is not None:
@@ -285,6 +297,7 @@ class NVCLightSampler(LightSampler):
             self.cache.reset()  # lights appeared or went
             self.begun = False
             field = None
+        self.cells = None
         alone = constants.cluster_choice == "visibility"
         return VisibleLights(table, groups, field, self.candidates, constants.floor, alone)
 
@@ -298,6 +311,15 @@ class NVCLightSampler(LightSampler):
         self.begun = True
         self.cache.train(scene, sensor, self.sampler.table, self.sampler.groups, frames=steps)
         self.sampler.field = self.cache.field
+        if self.in_media == "cells" and self.plan.facts.media and self.sampler.groups.single:
+            if self.cells is None:
+                self.cells = CellLights(self.sampler, self.cache.field.box)
+            with dr.suspend_grad():
+                self.cells.follow(self.sampler, self.cache.steps, self.cache.random_seed(self.cache.steps))
+
+    def lights(self, scene, sensor, train: bool = True):
+        lights = super().lights(scene, sensor, train)
+        return lights if lights is None or self.cells is None else self.cells
 
     def statistics(self) -> dict:
         if self.sampler is None:

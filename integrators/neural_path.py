@@ -211,9 +211,8 @@ NeuralPathIntegrator.__doc__ = (
 
     In participating media paths also end at points where a medium scatters. The cache holds the radiance that is
     scattered there towards the path, :math:`\int p L d\omega`, p being the phase function; the medium's albedo is in
-    the throughput. The spread of a path has no angle there. No path ends at rough glass around a medium. Training paths
-    start at the camera alone, whatever ``world_share``, and ``roughening`` is refused. Measured: ``mi-neural doc
-    media``.
+    the throughput. The spread of a path has no angle there. No path ends at rough glass around a medium. ``roughening``
+    is refused. Measured: ``mi-neural doc media``.
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),

@@ -100,6 +100,8 @@ class OutgoingIntegrator(CacheIntegrator):
             share = self.outgoing_keys["unbounded_share"] if self.media is None else self.unbounded_in_media
             self.cache.training = replace(self.cache.training, unbounded_share=share)
             self.cache.walk = self.walk
+            if self.media is not known_media and self.cache.field is not None:
+                self.cache.field.places.forget_media()  # their numbers are of other media
             self.cache.clear_recordings()
 
     def default_paths(self) -> int:

@@ -140,7 +140,10 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         media = self.media
 
         def step(path, sampler):
-            found, sampler = media.bounce(self, scene, lights, path, sampler)
+            numbers, sampler = paths.draw_numbers(sampler)
+            if not media.partial:  # elsewhere a path may stay at its first vertex for some steps
+                numbers = paths.choose_numbers(path.depth == 1, paths.stratified(sampler), numbers)
+            found, sampler = media.bounce(self, scene, lights, path, sampler, numbers)
             path = media.advance(self, path, found)
             return paths.roulette(path, sampler, self.rr_depth + 1)  # volpath's begins one bounce later
 

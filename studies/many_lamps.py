@@ -2,7 +2,8 @@
 
 A hall of square bays, ten small coloured lamps in each: half of them hang below the tops of the partitions and shine
 down, half stand on the floor and shine to one side. The partitions hide most lamps from any place. The camera looks
-down on the bays from a corner. Lamps differ in power by a factor of 16. The same N gives the same file.
+down on the bays from a corner. Lamps differ in power by a factor of 16. The same N gives the same file. With ``--fog
+EXTINCTION`` (per metre; a bay is 4 m wide) the hall is full of fog that scatters nine tenths of what it takes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 BAY, HEIGHT, PARTITION, HANGING = 4.0, 8.0, 2.4, 2.0
 LAMPS_IN_A_BAY = 10
 
-HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_lamps.py {n} FILE.xml -->
+HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_lamps.py {n} FILE.xml{options} -->
 <scene version="3.0.0">
     <default name="resx" value="320"/>
     <default name="resy" value="180"/>
@@ -35,7 +36,7 @@ HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_l
             <integer name="height" value="$resy"/>
             <string name="pixel_format" value="rgb"/>
             <rfilter type="box"/>
-        </film>
+        </film>{seen_through}
     </sensor>
     <bsdf type="twosided" id="plaster">
         <bsdf type="diffuse"> <rgb name="reflectance" value="0.6, 0.58, 0.55"/> </bsdf>
@@ -47,6 +48,19 @@ HEAD = """<!-- {n} lamps in {side} x {side} bays; made by: python studies/many_l
         </bsdf>
     </bsdf>
     <bsdf type="diffuse" id="black"> <rgb name="reflectance" value="0, 0, 0"/> </bsdf>
+"""
+
+FOG = """    <medium type="homogeneous" id="fog">
+        <float name="scale" value="{extinction:g}"/>
+        <rgb name="albedo" value="0.9, 0.9, 0.9"/>
+        <phase type="hg"> <float name="g" value="0.4"/> </phase>
+    </medium>
+"""
+HULL = """    <shape type="cube" id="hull">
+        <transform name="to_world"> <scale value="{half}, {half}, {half}"/> </transform>
+        <bsdf type="null"/>
+        <ref name="interior" id="fog"/>
+    </shape>
 """
 
 
@@ -73,12 +87,18 @@ def placed(center, along, across) -> np.ndarray:
     return matrix
 
 
-def scene_xml(n: int) -> str:
-    """The scene of `n` lamps as text."""
+def scene_xml(n: int, extinction: float = 0.0) -> str:
+    """The scene of `n` lamps as text, in fog where it has an `extinction`."""
     rng = np.random.default_rng(n)
     side = max(1, int(np.ceil(np.sqrt(n / LAMPS_IN_A_BAY))))
     half = side * BAY / 2
-    text = [HEAD.format(n=n, side=side, eye=f"{half - 0.5:.6g}", seen=f"{half - 7:.6g}")]
+    seen_through = ' <ref name="medium" id="fog"/>' if extinction else ""
+    head = HEAD.format(n=n, side=side, eye=f"{half - 0.5:.6g}", seen=f"{half - 7:.6g}", seen_through=seen_through,
+                       options=f" --fog {extinction:g}" if extinction else "")  # fmt: skip
+    if extinction:
+        first = head.index("    <sensor")
+        head = head[:first] + FOG.format(extinction=extinction) + head[first:] + HULL.format(half=f"{half + HEIGHT:g}")
+    text = [head]
     text += [
         rectangle(placed([0, 0, 0], [half, 0, 0], [0, half, 0]), "floor_paint"),
         rectangle(placed([0, 0, HEIGHT], [half, 0, 0], [0, -half, 0]), "plaster"),
@@ -111,13 +131,16 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("lamps", type=int, help="how many")
     parser.add_argument("file", type=Path, help="scene file to write")
+    parser.add_argument("--fog", type=float, default=0.0, metavar="EXTINCTION", help="per metre")
     args = parser.parse_args(argv)
     if args.lamps < 1:
         parser.error(f"lamps is {args.lamps}; give 1 or more")
     if args.file.suffix != ".xml":
         parser.error(f"{args.file} does not end in .xml; scene files do")
+    if not args.fog >= 0:
+        parser.error(f"--fog is {args.fog}; give 0 or more")
     args.file.parent.mkdir(parents=True, exist_ok=True)
-    args.file.write_text(scene_xml(args.lamps))
+    args.file.write_text(scene_xml(args.lamps, args.fog))
     return 0
 
 

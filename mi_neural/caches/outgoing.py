@@ -296,6 +296,10 @@ class OutgoingField(TrainedField):
     def scalars(self) -> dict:
         return {**super().scalars(), "scale": float(self.scale[0]), "eta": float(self.eta[0])}
 
+    def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        super().set_arrays(arrays)
+        self.places.forget_media()
+
     def set_scalars(self, given: dict) -> None:
         scale, eta = given["scale"], given["eta"]
         if not (0 <= scale < math.inf and 0 <= eta <= 1):
@@ -408,7 +412,8 @@ def training_paths(
         return field.query(*walk.surface(path, active, glossy).inputs()), sampler
 
     # Close before the place, where hardly anything can lie between
-    places = field.places.position, field.places.view, 1e-3 * dr.norm(1 / field.box_inv_extent)
+    known = field.places
+    places = known.position, known.view, 1e-3 * dr.norm(1 / field.box_inv_extent), known.inside
     return trace_training_paths(scene, sensor, sampler, plan, query, lights, places, glossy, walk)
 
 
@@ -495,7 +500,8 @@ class OutgoingCache(IncidentCache):
         field.count(records.surface.position, records.valid, decay)
         if self.training.world_share > 0:
             sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x9E3779B9)
-            field.places.remember(records.surface.position, records.surface.view, records.valid, sampler)
+            surface = records.surface
+            field.places.remember(surface.position, surface.view, records.valid, sampler, records.inside)
 
     def start(self, scene, sensor, lights=None) -> None:
         """Measure where light is asked for and how bright it is, and make the field; no training."""
@@ -506,7 +512,7 @@ class OutgoingCache(IncidentCache):
         box = scene.bbox()
         whole = np.array(box.min).ravel(), np.array(box.max).ravel()
         low, high = encoding.record_box(points.T[valid], *whole)
-        if self.training.world_share > 0 and self.walk.anywhere:
+        if self.training.world_share > 0 and not self.walk.in_media:
             low, high = _reaching(low, high, *whole)
         target, scale = np.sort(target[valid]), 0.0
         if target.size:

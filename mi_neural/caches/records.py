@@ -71,24 +71,28 @@ class OutgoingRecords:
     """A fixed number of records; where `valid` is false, a record holds nothing.
 
     target   estimates of the radiance that leaves `surface` towards its `view`, what the cache holds of it
+    inside   in scenes with participating media, what it is in: see :meth:`~mi_neural.render.walk.SurfaceWalk.inside`
     """
 
     surface: Surface
     target: mi.Color3f
     valid: mi.Bool
+    inside: mi.UInt32 | None = None
 
 
-def empty_surfaces(n: int) -> OutgoingRecords:
-    """`n` records that hold nothing."""
+def empty_surfaces(n: int, in_media: bool = False) -> OutgoingRecords:
+    """`n` records that hold nothing, with places for `inside` where there are media."""
     vectors = (dr.zeros(mi.Point3f, n), dr.zeros(mi.Vector3f, n), dr.zeros(mi.Vector3f, n), dr.zeros(mi.Color3f, n))
-    return OutgoingRecords(Surface(*vectors, dr.zeros(mi.Float, n)), dr.zeros(mi.Color3f, n), dr.zeros(mi.Bool, n))
+    return OutgoingRecords(Surface(*vectors, dr.zeros(mi.Float, n)), dr.zeros(mi.Color3f, n), dr.zeros(mi.Bool, n),
+                           dr.zeros(mi.UInt32, n) if in_media else None)  # fmt: skip
 
 
 def packed(records, n: int):
     """The valid records in `n` places, in their order; what does not fit is left out, the rest holds nothing."""
     slot = dr.prefix_sum(dr.select(records.valid, mi.UInt32(1), mi.UInt32(0)))
     fits = records.valid & (slot < n)
-    out = empty_surfaces(n) if isinstance(records, OutgoingRecords) else empty_records(n)
+    outgoing = isinstance(records, OutgoingRecords)
+    out = empty_surfaces(n, records.inside is not None) if outgoing else empty_records(n)
 
     def put(to, value):
         if is_dataclass(to):

@@ -88,18 +88,21 @@ def first_rays(sensor, sampler, n_paths: int, world_share: float, places: tuple 
     their viewers (world space; not finite where unknown), and how far before them to start."""
     # Stratified over the film: paths are the samples of one pixel, the film
     ray = film_rays(sensor, sampler.stratified_2d(0), sampler)
-    if places is None or world_share <= 0:
-        return ray
+    return ray if places is None or world_share <= 0 else _world_rays(ray, sampler, n_paths, world_share, places)[0]
+
+
+def _world_rays(ray, sampler, n_paths: int, world_share: float, places: tuple) -> tuple:
+    """(rays, of which a share leads to random places instead of where it did, which ones do, numbers of the places)."""
     # Every so many-th lane, evenly: multiples of the golden ratio
     lane = dr.arange(mi.UInt32, n_paths)
     world = mi.Float((lane * mi.UInt32(0x9E3779B9)) >> 8) * 2**-24 < world_share
-    position, view, distance = places
+    position, view, distance = places[:3]
     n_places = dr.width(position)
     i = dr.minimum(mi.UInt32(sampler.next_1d() * n_places), n_places - 1)
     p, w = dr.gather(mi.Point3f, position, i), dr.gather(mi.Vector3f, view, i)
     world &= dr.all(dr.isfinite(p))
     ray.o, ray.d = dr.select(world, p + distance * w, ray.o), dr.select(world, -w, ray.d)
-    return ray
+    return ray, world, i
 
 
 def _twin_numbers(sampler, plan: Suffixes) -> tuple:
@@ -119,7 +122,7 @@ def _twin_rays(sensor, sampler, plan: Suffixes, places):
 
 def _first_vertices(scene, sensor, sampler, plan: Suffixes, places, walk: SurfaceWalk) -> tuple:
     """(rays, paths at what they meet, sampler)."""
-    if walk.anywhere:
+    if not walk.in_media:
         if plan.twins:
             ray = _twin_rays(sensor, sampler, plan, places)
         else:
@@ -127,13 +130,25 @@ def _first_vertices(scene, sensor, sampler, plan: Suffixes, places, walk: Surfac
         return ray, paths.start(ray, scene.ray_intersect(ray), mi.Bool(True)), sampler
     # Where a ray ends in a medium is random: twins share the point, too
     if not plan.twins:
-        ray = first_rays(sensor, sampler, plan.n_paths, 0, None)
-        return ray, *walk.camera_vertex(UNLIMITED, scene, ray, sampler, mi.Bool(True))
+        return _first_in_media(scene, sensor, sampler, plan.n_paths, plan.world_share, places, walk)
     n_rays, numbers = _twin_numbers(sampler, plan)
-    ray = first_rays(sensor, numbers, n_rays, 0, None)
-    path, _ = walk.camera_vertex(UNLIMITED, scene, ray, numbers, mi.Bool(True))
+    ray, path, _ = _first_in_media(scene, sensor, numbers, n_rays, plan.world_share, places, walk)
     dr.eval(ray, path)  # together: to gather from each of its parts would follow the rays once for each
     return fork(ray, plan.n_paths), fork(path, plan.n_paths), sampler
+
+
+def _first_in_media(scene, sensor, sampler, n_paths: int, world_share: float, places, walk) -> tuple:
+    """As :func:`_first_vertices`, in participating media. Paths start at places of which is known what they are in."""
+    ray = first_rays(sensor, sampler, n_paths, 0, None)
+    if places is None or world_share <= 0:
+        return ray, *walk.camera_vertex(UNLIMITED, scene, ray, sampler, mi.Bool(True))
+    moved, world, i = _world_rays(mi.Ray3f(ray), sampler, n_paths, world_share, places)
+    inside = dr.gather(mi.UInt32, places[3], i, world)
+    world &= inside > 0
+    path, sampler = walk.camera_vertex(UNLIMITED, scene, ray, sampler, ~world)
+    ray = dr.select(world, moved, ray)
+    ray.maxt = dr.select(world, places[2], ray.maxt)
+    return ray, *walk.start_in(scene, path, ray, inside, sampler, world)
 
 
 @dataclass
@@ -158,14 +173,15 @@ class Vertices:
     pdf: mi.Float
 
     @classmethod
-    def empty(cls, size: int, densities: bool = False) -> Vertices:
+    def empty(cls, size: int, densities: bool = False, in_media: bool = False) -> Vertices:
         colours = (dr.zeros(mi.Color3f, size) for _ in range(3))
         direction, smooth, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
         pdf = dr.zeros(mi.Float, size if densities else 1)
-        return cls(empty_surfaces(size), *colours, direction, smooth, stops, pdf)
+        return cls(empty_surfaces(size, in_media), *colours, direction, smooth, stops, pdf)
 
-    def keep(self, i, si, found: paths.Bounce, terminal, surface) -> None:
-        """Write entries `i`; `surface` is None where only positions and normals of surfaces are wanted."""
+    def keep(self, i, si, found: paths.Bounce, terminal, surface, inside=None) -> None:
+        """Write entries `i`; `surface` is None where only positions and normals of surfaces are wanted, `inside` where
+        there are no media."""
         dr.scatter(self.emitted, found.Le, i)
         dr.scatter(self.estimated, found.L_nee, i)
         dr.scatter(self.weight, found.weight, i)
@@ -175,6 +191,8 @@ class Vertices:
         else:
             dr.scatter(self.records.surface.position, si.p, i)
             dr.scatter(self.records.surface.normal, vertex.facing(si), i)
+        if inside is not None:
+            dr.scatter(self.records.inside, inside, i)
         dr.scatter(self.records.valid, terminal, i)
         dr.scatter(self.direction, found.ray.d, i)
         dr.scatter(self.smooth, terminal & found.traced & ~found.delta, i)
@@ -196,7 +214,7 @@ class _Tracer:
     def bounce(self, path, n_rough, sampler, albedo=None):
         """One bounce, the surface roughened as the path has bounced `n_rough` times before: (Bounce, sampler)."""
         bsdf = path.si.bsdf(path.ray)
-        if self.plan.roughening > 0 and self.walk_on.anywhere:
+        if self.plan.roughening > 0 and not self.walk_on.in_media:
             albedo = surface_of(path.si, bsdf, path.active, False).albedo if albedo is None else albedo
             share = 1 - dr.power(mi.Float(1 - self.plan.roughening), n_rough)
             opaque = vertex.has_smooth(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
@@ -208,14 +226,14 @@ class _Tracer:
         plan, n_kept = self.plan, self.plan.n_vertices - 1
         lane = dr.arange(mi.UInt32, plan.n_paths)
         unbounded = lane < plan.n_unbounded
-        vertices = Vertices.empty(plan.n_paths * n_kept, plan.densities)
+        vertices = Vertices.empty(plan.n_paths * n_kept, plan.densities, self.walk_on.in_media)
 
         def step(k, path, spread, ends, n_rough, open_, sampler):
             i = k * plan.n_paths + lane
             terminal = self.walk_on.terminal(path, path.active)
             surface = self.surface(path, path.active) if plan.surfaces else None
             found, sampler = self.bounce(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
-            vertices.keep(i, path.si, found, terminal, surface)
+            vertices.keep(i, path.si, found, terminal, surface, self.walk_on.inside(path))
             if plan.densities:
                 dr.scatter(vertices.pdf, found.bs.pdf, i)
             before, path = path, self.walk_on.advance(UNLIMITED, path, found)

@@ -27,6 +27,9 @@ from . import path as paths
 from . import vertex
 from .tracking import colour, event, exists, flown, is_boundary, medium_interaction
 
+#: Dimension of the stratified number by which the distance along a camera ray is sampled.
+DISTANCE = 2**16
+
 
 @dataclass
 class Scattering:
@@ -159,6 +162,7 @@ class Media:
     """How paths go through the media of a scene. Its attributes are facts of the scene, which are compiled.
 
     media           the media, by their address
+    ids             their identity in pointers
     heterogeneous   whether the density of a medium varies
     boundaries      whether there are surfaces that let all light pass
     partial         whether there are surfaces that let a part of the light pass, or shine and let it pass
@@ -166,6 +170,7 @@ class Media:
 
     def __init__(self, media: dict, heterogeneous: bool, boundaries: bool, partial: bool):
         self.media = media
+        self.ids = [int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(m))[0]) for m in media.values()]
         self.heterogeneous, self.boundaries, self.partial = heterogeneous, boundaries, partial
         pairs = [(params, key) for params in map(parameters.traverse, media.values()) for key in params.keys()]
         self.edits = parameters.Edits([(params, key) for params, key in pairs if _is_hidden(params, key)])
@@ -187,6 +192,20 @@ class Media:
         """Whether a parameter has changed, since the call before, that recorded functions take for a constant."""
         return self.edits.changed()
 
+    def number(self, medium):
+        """Number of a medium, 1, 2, ...; 0: none. It is the same as long as the scene has these media."""
+        identity, number = dr.reinterpret_array(mi.UInt32, medium), mi.UInt32(0)
+        for k, known in enumerate(self.ids):
+            number = dr.select(identity == known, k + 1, number)
+        return number
+
+    def numbered(self, number):
+        """The medium of a number."""
+        identity = mi.UInt32(0)
+        for k, known in enumerate(self.ids):
+            identity = dr.select(number == k + 1, known, identity)
+        return dr.reinterpret_array(mi.MediumPtr, identity)
+
     # -------------------------------------------------------------------------------------------------------------
     # The steps of a path
 
@@ -202,7 +221,8 @@ class Media:
         channel = dr.minimum(mi.UInt32(sampler.next_1d() * n), n - 1) if mi.is_rgb else mi.UInt32(0)
         hidden = active if integrator.hide else None
         end, sampler = self.fly(
-            integrator, scene, ray, medium, channel, mi.Spectrum(1 / n), sampler, active, hidden
+            integrator, scene, ray, medium, channel, mi.Spectrum(1 / n), sampler, active, hidden,
+            None if self.heterogeneous else sampler.stratified_1d(DISTANCE),
         )  # fmt: skip
         L, valid = mi.Spectrum(0), mi.Bool(False)
         if not integrator.hide:
@@ -281,20 +301,22 @@ class Media:
     # -------------------------------------------------------------------------------------------------------------
     # Rays through media
 
-    def fly(self, integrator, scene, ray, medium, channel, shares, sampler, active, hidden) -> tuple:
+    def fly(self, integrator, scene, ray, medium, channel, shares, sampler, active, hidden, u=None) -> tuple:
         """Follow a ray to where the medium scatters or a surface does not let all light pass: (:class:`Flight`,
         sampler). Of rays that `hidden` names emitters are skipped, as long as they are in no medium; None: of none.
 
         E[weight] over all that may happen is the transmittance, times the scattering coefficient where it scatters.
+        `u`: the number by which the first distance is sampled, in media that are homogeneous; None: one of the sampler.
         """
 
-        def step(f, sampler):
+        def step(f, sampler, u=None):
             inside = f.going & exists(f.medium)
             if self.heterogeneous:
                 si = self._meet(integrator, scene, f.ray, f.going, hidden, inside)
                 f, sampler = self._track(f, si.t, channel, sampler, inside)
             else:
-                mei = f.medium.sample_interaction(f.ray, sampler.next_1d(), channel, inside)
+                u = sampler.next_1d() if u is None else u
+                mei = f.medium.sample_interaction(f.ray, u, channel, inside)
                 near = mi.Ray3f(f.ray)
                 near.maxt = dr.select(inside & mei.is_valid(), mei.t, near.maxt)
                 si = self._meet(integrator, scene, near, f.going, hidden, inside)
@@ -311,8 +333,15 @@ class Media:
         f = Flight(mi.Bool(active), mi.Ray3f(ray), dr.zeros(mi.SurfaceInteraction3f), mi.Point3f(0), mi.Bool(False),
                    mi.MediumPtr(medium), mi.Spectrum(1), mi.Spectrum(shares))  # fmt: skip
         if not self.boundaries:
-            return step(f, sampler)
-        return dr.while_loop((f, sampler), lambda f, sampler: f.going, step, label="flight")
+            return step(f, sampler, u)
+        if u is None:
+            return dr.while_loop((f, sampler), lambda f, sampler: f.going, step, label="flight")
+
+        def first(f, sampler, u):
+            f, sampler = step(f, sampler, u)
+            return f, sampler, sampler.next_1d()
+
+        return dr.while_loop((f, sampler, u), lambda f, sampler, u: f.going, first, label="camera flight")[:2]
 
     def _meet(self, integrator, scene, ray, active, hidden, inside):
         """The surface that a ray meets, behind emitters where these are `hidden`."""
@@ -353,7 +382,14 @@ class Media:
         pass, sampler). `medium`: where the ray begins. E[share] is the transmittance."""
 
         def step(active, ray, medium, share, sampler):
-            if self.boundaries or self.partial:
+            if self.boundaries and not self.partial:
+                # What is met is looked at in full where it lets light pass
+                pi = scene.ray_intersect_preliminary(ray, active=active)
+                meets, length = active & pi.is_valid(), dr.minimum(pi.t, ray.maxt)
+                passes = meets & is_boundary(pi.shape.bsdf())
+                si = pi.compute_surface_interaction(ray, mi.RayFlags.All, passes)
+                share *= dr.select(meets, dr.select(passes, si.bsdf().eval_null_transmission(si, passes), 0), 1)
+            elif self.partial:
                 si = scene.ray_intersect(ray, active)
                 meets, length = active & si.is_valid(), dr.minimum(si.t, ray.maxt)
                 share *= dr.select(meets, si.bsdf().eval_null_transmission(si, meets), 1)

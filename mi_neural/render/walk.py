@@ -16,7 +16,7 @@ import mitsuba as mi
 from ..estimators.spread import PathSpread
 from . import path as paths
 from . import vertex
-from .media import Media
+from .media import Media, Scattering
 from .surface import Surface, surface_of
 
 
@@ -25,8 +25,8 @@ class SurfaceWalk:
 
     #: Added to ``rr_depth``.
     later = 0
-    #: Whether paths may start anywhere, and surfaces may be made rougher.
-    anywhere = True
+    #: Whether vertices may lie in media. Surfaces are not made rougher then.
+    in_media = False
     #: Probability at most with which a training path survives roulette; vertices after which one that has no end in the
     #: cache is given up, and whether it then ends there.
     most_survival, most_vertices, gives_up = 0.95, 256, True
@@ -51,6 +51,11 @@ class SurfaceWalk:
         """Where a path stands: (position, normal on the side that it came from)."""
         return path.si.p, vertex.facing(path.si)
 
+    def inside(self, path):
+        """What a path is in where it stands: None where there are no media, else a number that :meth:`start_in` takes.
+        """
+        return
+
     def surface(self, path, active, glossy: bool) -> Surface:
         """Where a path stands, as a cache of outgoing radiance sees it."""
         return surface_of(path.si, path.si.bsdf(path.ray), active, glossy)
@@ -74,7 +79,7 @@ class MediaWalk(SurfaceWalk):
     """
 
     later = 1
-    anywhere = False
+    in_media = True
     most_survival, most_vertices, gives_up = 1.0, 128, False
 
     def __init__(self, media: Media, camera: mi.Medium | None = None):
@@ -98,6 +103,31 @@ class MediaWalk(SurfaceWalk):
         normal = dr.select(path.scattered, path.ray.d, vertex.facing(path.si))
         return dr.select(path.scattered, path.p, path.si.p), normal
 
+    def inside(self, path):
+        """1 in no medium, then two numbers for each medium: on a surface, and at a point in it; 0 is for unknown."""
+        return 1 + 2 * self.media.number(path.medium) + dr.select(path.scattered, mi.UInt32(1), 0)
+
+    def start_in(self, scene, path, ray, inside, sampler, starts) -> tuple:
+        """(`path`, but one that stands at what `ray` met once before where it `starts`, sampler).
+
+        `inside`: of the place that was met, by :meth:`inside`. A surface lies on the ray, and is looked for anew. In a
+        medium the path starts at the end of the ray, ``ray.maxt``.
+        """
+        number = dr.select(starts, inside - 1, 0)
+        scattered, medium = starts & (number % 2 == 1), self.media.numbered(number // 2)
+        clear = mi.Ray3f(ray)
+        clear.maxt = dr.largest(mi.Float)
+        si = scene.ray_intersect(clear, starts & ~scattered)
+        n = dr.size_v(mi.Spectrum)
+        channel = dr.minimum(mi.UInt32(sampler.next_1d() * n), n - 1) if mi.is_rgb else mi.UInt32(0)
+        new = {
+            "L": mi.Spectrum(0), "β": mi.Spectrum(1), "η": mi.Float(1), "depth": mi.UInt32(1), "length": mi.Float(0),
+            "ray": clear, "si": si, "valid": scattered | si.is_valid(), "active": scattered | si.is_valid(),
+            "p": ray(ray.maxt), "scattered": scattered, "medium": medium, "channel": channel,
+            "shares": mi.Spectrum(1 / n), "last": Scattering.at_camera(clear),
+        }  # fmt: skip
+        return _where(starts, new, path), sampler
+
     def surface(self, path, active, glossy):
         """A point in a medium has the normal ``-view``, which no surface that is seen has, and reflectance 1."""
         surface = surface_of(path.si, path.si.bsdf(path.ray), active & ~path.scattered, glossy)
@@ -119,6 +149,17 @@ class MediaWalk(SurfaceWalk):
         cosine = dr.select(path.scattered, 1, dr.dot(path.si.n, path.ray.d))
         distance, arrives = dr.norm(self.place(path)[0] - origin), path.scattered | path.si.is_valid()
         return spread.reach(distance, cosine, pdf, delta, arrives, smooth)
+
+
+def _where(mask, new: dict, path):
+    """`path` with the fields of `new` where the mask says so."""
+    changed = {}
+    for name, value in new.items():
+        old = getattr(path, name)
+        if is_dataclass(old):
+            value = _where(mask, {f.name: getattr(value, f.name) for f in fields(old)}, old)
+        changed[name] = None if old is None else value if is_dataclass(old) else dr.select(mask, value, old)
+    return replace(path, **changed)
 
 
 #: For scenes without media.
