@@ -5,6 +5,7 @@ lit cube (1 less the emission of 1/2), 1 in the point-lit sphere; after at most 
 """
 
 import math
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,7 @@ from mi_neural.caches.training_paths import Suffixes, trace_training_paths
 from mi_neural.render import vertex
 from mi_neural.render.sampling import PathSampler
 
+ROOM_WITH_A_SLIT = Path(__file__).resolve().parents[1] / "studies/slit_room.xml"
 REFLECTED = {"lit_cube": 0.5, "point_lit_sphere": 1.0}
 SMALL = Training(n_paths=1024)
 LIGHT = 'name="radiance" value="0.5, 0.5, 0.5"'
@@ -264,35 +266,13 @@ def test_local_limit_is_four_by_default():
     assert Training().local_limit == 4
 
 
-def room_with_a_slit():
-    """A closed room of albedo 0.6; a wall, which leaves a slit on all sides, parts it from its lamp."""
-    T = mi.ScalarTransform4f
-
-    def wall(at, axis, angle, size=1.0, albedo=0.6, **more):
-        bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
-        place = T().translate(at).rotate(axis, angle).scale(size)
-        return {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided", "b": bsdf}, **more}
-
-    x, y = (1, 0, 0), (0, 1, 0)
-    lamp = {"type": "area", "radiance": {"type": "rgb", "value": 40.0}}
-    scene = mi.load_dict({
-        "type": "scene", "back": wall((0, 0, -1), y, 0), "front": wall((0, 0, 1), y, 180),
-        "floor": wall((0, -1, 0), x, -90), "ceiling": wall((0, 1, 0), x, 90),
-        "left": wall((-1, 0, 0), y, 90), "right": wall((1, 0, 0), y, -90, albedo=0.3),
-        "part": wall((0.05, 0, 0), y, 90, (0.97, 0.97, 1), 0.7),
-        "lamp": {**wall((-0.6, 0.9, 0), x, 90, 0.2), "bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": lamp},
-        "sensor": {"type": "perspective", "fov": 60, "film": {"type": "hdrfilm", "width": 16, "height": 16},
-                   "to_world": T().look_at([0.8, 0, 0.8], [0.3, -0.2, -0.9], [0, 1, 0])},
-    })  # fmt: skip
-    return scene, scene.sensors()[0]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("limit, low, high", [(Training.local_limit, -0.02, 0.025), (math.inf, 0.03, 0.1)])
 def test_cache_of_a_bright_half_behind_a_slit_is_not_too_bright(limit, low, high):
     """Few paths reach the half with the lamp, 30 times as bright as what the camera sees. Where each place's own
     prediction is the norm, it comes out too bright. Targets: of paths that run on to their end, 0.3 % of error."""
-    place, n = room_with_a_slit(), 2**19
+    scene, n = mi.load_file(str(ROOM_WITH_A_SLIT)), 2**19
+    place = scene, scene.sensors()[0]
     cache = IncidentCache(Training(local_limit=limit))
     cache.train(*place, frames=300)
     sampler = PathSampler.make(dr.arange(mi.UInt32, n), mi.UInt32(9))
