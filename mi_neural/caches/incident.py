@@ -271,8 +271,7 @@ class IncidentCache(Trainer):
         return trace_records(scene, sensor, None, self.training, seed, lights)
 
     def frame(self, scene, sensor, lights, cache, ages, seed, rate_factor):
-        """Trace records and take a step on them; see :func:`~mi_neural.caches.trainer.found` for the result. Is frozen.
-        """
+        """Trace records and take a step on them: what :func:`~mi_neural.caches.trainer.found` gives. Is frozen."""
         with dr.suspend_grad():
             plain = getattr(cache, "field", cache)
             places = ages.left(1e-3 * dr.norm(1 / plain.box_inv_extent))
