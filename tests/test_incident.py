@@ -249,7 +249,7 @@ def test_rate_falls_to_a_tenth_and_decay_grows_from_zero():
     assert {Training(ema_decay=0.0).decay(k) for k in (0, 10, 1000)} == {0}
 
 
-@pytest.mark.parametrize("limit, ratio", [(4.0, 1.0), (math.inf, (25**2 + 10) / (15**2 + 10))])
+@pytest.mark.parametrize("limit, ratio", [(8.0, 1.0), (math.inf, (25**2 + 10) / (15**2 + 10))])
 def test_errors_of_bright_places_weigh_alike_upwards_and_downwards(monkeypatch, limit, ratio):
     """Targets 20 times the scene's mean, predictions of 15 and 25 that are their places' local means: with a norm of
     these alone the error downwards pulls 2.7 times as hard."""
@@ -262,14 +262,14 @@ def test_errors_of_bright_places_weigh_alike_upwards_and_downwards(monkeypatch, 
     assert up < 0 < down and -up / down == pytest.approx(ratio, rel=1e-4)
 
 
-def test_local_limit_is_four_by_default():
-    assert Training().local_limit == 4
+def test_local_limit_is_eight_by_default():
+    assert Training().local_limit == 8
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit, low, high", [(Training.local_limit, -0.02, 0.025), (math.inf, 0.03, 0.1)])
 def test_cache_of_a_bright_half_behind_a_slit_is_not_too_bright(limit, low, high):
-    """Few paths reach the half with the lamp, 30 times as bright as what the camera sees. Where each place's own
+    """Few paths reach the half with the lamp, 37 times as bright as the camera's. Where each place's own
     prediction is the norm, it comes out too bright. Targets: of paths that run on to their end, 0.3 % of error."""
     scene, n = mi.load_file(str(ROOM_WITH_A_SLIT)), 2**19
     place = scene, scene.sensors()[0]
