@@ -40,8 +40,8 @@ INCIDENT_PRESETS = """
 
     - ``loss``, ``epsilon``: weighted, 0.001 / local, 10 / relative to the prediction in each direction a sunlit
       courtyard is 5.5 % too dark, by the local mean within 0.3 %; with an epsilon of 0.03 a room lit through a slit
-      drifts by +7 to +12 %, with 10 by +1 to +3 %, with a ``local_limit`` of 8 as well it stays within 1 %. Cornell box,
-      see below: relMSE 0.010 / 0.0022.
+      drifts by +7 to +12 %, with 10 by +1 to +3 %, with a ``local_limit`` of 8 as well it stays within 1 %. Cornell
+      box, see below: relMSE 0.010 / 0.0022.
     - ``inputs``: normal, albedo, roughness / none / incident radiance depends on position and direction alone;
       Cornell box: relMSE 0.0022 / 0.0022.
     - ``levels``, ``width``, ``hidden_layers``, ``direction_degree``: 12, 64, 4, 4 (25 values, 5 bands) / 8, 32, 2, 3 /
