@@ -5,7 +5,7 @@ from __future__ import annotations
 from mi_neural.caches import presets
 from mi_neural.caches.encoding import SURFACE
 from mi_neural.caches.field import FieldShape
-from mi_neural.caches.incident import LOSSES
+from mi_neural.caches.incident import LOSSES, Training
 from mi_neural.integrators.common import CacheIntegrator
 
 #: Rows of these keys, for the docstrings
@@ -25,7 +25,12 @@ INCIDENT_KEYS = """
        - |string|
        - What training lessens: the squared error over ``local``, the squared mean prediction over the hemisphere at the
          record's position; ``weighted``, that of the record itself, error and prediction times the throughput f cos/p
-         of its direction, and all times p. (Default: local)"""
+         of its direction, and all times p. (Default: local)
+     * - local_limit
+       - |float|
+       - Of ``loss="local"``: the mean prediction of a place counts as at most so many times the mean target of the
+         scene. Places brighter than that then weigh alike, and their errors upwards as much as those downwards.
+         (Default: 8)"""
 
 #: The list of the constants of both presets, for the docstrings
 INCIDENT_PRESETS = """
@@ -35,7 +40,8 @@ INCIDENT_PRESETS = """
 
     - ``loss``, ``epsilon``: weighted, 0.001 / local, 10 / relative to the prediction in each direction a sunlit
       courtyard is 5.5 % too dark, by the local mean within 0.3 %; with an epsilon of 0.03 a room lit through a slit
-      drifts by +7 to +12 %, within 1 % with 10. Cornell box, see below: relMSE 0.010 / 0.0022.
+      drifts by +7 to +12 %, with 10 by +1 to +3 %, with a ``local_limit`` of 8 as well it stays within 1 %. Cornell
+      box, see below: relMSE 0.010 / 0.0022.
     - ``inputs``: normal, albedo, roughness / none / incident radiance depends on position and direction alone;
       Cornell box: relMSE 0.0022 / 0.0022.
     - ``levels``, ``width``, ``hidden_layers``, ``direction_degree``: 12, 64, 4, 4 (25 values, 5 bands) / 8, 32, 2, 3 /
@@ -76,7 +82,7 @@ class IncidentIntegrator(CacheIntegrator):
     def training_keys(self, props) -> dict:
         loss = props.get("loss", LOSSES[0])
         self._check(loss in LOSSES, f"loss is '{loss}'; give one of: {', '.join(LOSSES)}")
-        return {"loss": loss}
+        return {"loss": loss, "local_limit": props.get("local_limit", Training.local_limit)}
 
     def shape_keys(self, props) -> dict:
         inputs, degree = props.get("inputs", "none"), props.get("direction_degree", FieldShape.direction_degree)

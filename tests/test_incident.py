@@ -5,6 +5,7 @@ lit cube (1 less the emission of 1/2), 1 in the point-lit sphere; after at most 
 """
 
 import math
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -13,11 +14,15 @@ import pytest
 from expectation import assert_mean
 
 from mi_neural import scenes
+from mi_neural.caches import incident
 from mi_neural.caches.field import Field, FieldShape, Weights
 from mi_neural.caches.incident import IncidentCache, Training, reflect, trace_records
+from mi_neural.caches.records import TrainingRecords
+from mi_neural.caches.training_paths import Suffixes, trace_training_paths
 from mi_neural.render import vertex
 from mi_neural.render.sampling import PathSampler
 
+ROOM_WITH_A_SLIT = Path(__file__).resolve().parents[1] / "studies/slit_room.xml"
 REFLECTED = {"lit_cube": 0.5, "point_lit_sphere": 1.0}
 SMALL = Training(n_paths=1024)
 LIGHT = 'name="radiance" value="0.5, 0.5, 0.5"'
@@ -244,7 +249,44 @@ def test_rate_falls_to_a_tenth_and_decay_grows_from_zero():
     assert {Training(ema_decay=0.0).decay(k) for k in (0, 10, 1000)} == {0}
 
 
+@pytest.mark.parametrize("limit, ratio", [(8.0, 1.0), (math.inf, (25**2 + 10) / (15**2 + 10))])
+def test_errors_of_bright_places_weigh_alike_upwards_and_downwards(monkeypatch, limit, ratio):
+    """Targets 20 times the scene's mean, predictions of 15 and 25 that are their places' local means: with a norm of
+    these alone the error downwards pulls 2.7 times as hard."""
+    monkeypatch.setattr(incident, "local_mean", lambda *_: mi.Float(15, 25))
+    records, p = dr.zeros(TrainingRecords, 2), mi.Color3f(mi.Float(15, 25))
+    dr.enable_grad(p)
+    training = Training(epsilon=10.0, local_limit=limit)
+    dr.backward(incident._errors(constant_field(1.0), records, training, mi.UInt32(1), p, mi.Color3f(20), {}))
+    up, down = np.array(dr.grad(p))[0]
+    assert up < 0 < down and -up / down == pytest.approx(ratio, rel=1e-4)
+
+
+def test_local_limit_is_eight_by_default():
+    assert Training().local_limit == 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit, low, high", [(Training.local_limit, -0.02, 0.025), (math.inf, 0.03, 0.1)])
+def test_cache_of_a_bright_half_behind_a_slit_is_not_too_bright(limit, low, high):
+    """Few paths reach the half with the lamp, 37 times as bright as the camera's. Where each place's own
+    prediction is the norm, it comes out too bright. Targets: of paths that run on to their end, 0.3 % of error."""
+    scene, n = mi.load_file(str(ROOM_WITH_A_SLIT)), 2**19
+    place = scene, scene.sensors()[0]
+    cache = IncidentCache(Training(local_limit=limit))
+    cache.train(*place, frames=300)
+    sampler = PathSampler.make(dr.arange(mi.UInt32, n), mi.UInt32(9))
+    plan = Suffixes(n, 8, surfaces=False, n_unbounded=n)
+    records = trace_training_paths(*place, sampler, plan, None).incident
+    found = cache.field.query(cache.field.encode(records.position, records.normal), records.direction)
+    inside = np.array(records.valid & (records.position.x + 0.01 * records.normal.x < 0.05))
+    excess = np.array(found)[:, inside].mean() / np.array(records.target)[:, inside].mean() - 1
+    print(f"limit {limit}: {excess:+.1%} of {inside.sum()} records")
+    assert low < excess < high
+
+
 @pytest.mark.parametrize("key, value", [
+    ("local_limit", 0), ("local_limit", float("nan")),
     ("n_paths", 0), ("n_vertices", 1), ("n_tail", 0), ("n_local", 0), ("learning_rate", 0), ("learning_rate", -1),
     ("learning_rate", float("nan")), ("ema_decay", -0.1), ("ema_decay", 1.1), ("ema_decay", float("nan")),
 ])  # fmt: skip
