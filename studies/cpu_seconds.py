@@ -3,8 +3,8 @@
 For machines that other programs share: what they take does not count. Kernels are compiled before; Dr.Jit works with
 one thread, as threads that wait for work count as work. Integrators take turns, one repeat after another. The
 reference is rendered by ``plain_path`` with ``tree_lights`` at the depth that ``-D max_depth=`` gives, and kept in DIR.
-Prints and writes to DIR/results.json medians over the repeats, and how many times less trimmed relMSE each has than the
-first one (geometric mean over the repeats).
+Prints and writes to DIR/results.json, a record for each, medians over the repeats, and how many times less trimmed
+relMSE each has than the first one: geometric mean, least and most of the repeats.
 """
 
 from __future__ import annotations
@@ -94,13 +94,14 @@ def main(arguments: list[str] | None = None) -> int:
             facts |= {"relmse_trimmed": metrics.relmse_trimmed(image, known), "flip": metrics.flip(image, known).mean}
             rows[text].append(facts)
             print(repeat, text, {k: float(f"{v:.4g}") for k, v in facts.items()}, flush=True)
-    first, found = rows[options.integrator[0]], {}
+    first, records = rows[options.integrator[0]], []
     for text, own in rows.items():
-        found[text] = {k: float(np.median([row[k] for row in own])) for k in own[0]}
+        found = {k: float(np.median([row[k] for row in own])) for k in own[0]}
         ratios = [a["relmse_trimmed"] / b["relmse_trimmed"] for a, b in zip(first, own, strict=True)]
-        found[text]["times_less"] = float(np.exp(np.mean(np.log(ratios))))
-        print(text, {k: float(f"{v:.4g}") for k, v in found[text].items()})
-    report = {"environment": environment.describe(), "seconds": options.seconds, "results": found}
+        found |= {"times_less": float(np.exp(np.mean(np.log(ratios)))), "least": min(ratios), "most": max(ratios)}
+        print(text, {k: float(f"{v:.4g}") for k, v in found.items()})
+        records.append({"label": text, "scene": loaded.name, **found})
+    report = {"environment": environment.describe(), "seconds": options.seconds, "records": records}
     exr.write_text(options.output / "results.json", json.dumps(report, indent=1) + "\n")
     return 0
 
