@@ -30,7 +30,7 @@ def test_direct_light_of_several_samples_is_the_mean_over_frames_of_one_state():
 
 
 def test_settings_differ_from_the_first_in_what_they_name():
-    first, *others = blend_settings.VARIANTS.values()
+    first = next(iter(blend_settings.VARIANTS.values()))
     assert first == ({}, {}) and blend_settings.SLOW in blend_settings.VARIANTS
     for name, (keys, more) in blend_settings.VARIANTS.items():
         assert all(f"{k}={v}" in name for k, v in keys.items() if v is not None)
