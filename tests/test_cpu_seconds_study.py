@@ -4,7 +4,10 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 from load_study import FOLDER
+
+from mi_neural.image import exr
 
 
 def test_images_in_equal_cpu_seconds(tmp_path):
@@ -14,4 +17,6 @@ def test_images_in_equal_cpu_seconds(tmp_path):
     found = json.loads((tmp_path / "results.json").read_text())["records"]
     assert [record["label"] for record in found] == [words[1], words[3]] and found[0]["times_less"] == 1
     assert all(r["spp"] >= 1 and 0 < r["relmse_trimmed"] < 10 and r["least"] <= r["most"] for r in found)
-    assert (tmp_path / "reference.exr").is_file()
+    reference = exr.read(tmp_path / "reference.exr")
+    noise = reference.layer("variance")
+    assert noise.shape == reference.rgb.shape and 0 < noise.mean() < 0.01 * np.square(reference.rgb).mean()
