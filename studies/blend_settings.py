@@ -3,7 +3,8 @@
 The sun of a scene turns at frame 20 of 50. ``nirc`` renders each frame by its trained weights (``blend=fast``), by
 their average (``ema``) and by the blend of both after the paper's rule (``reliability=correlation``), in the first
 setting also after this package's (``evidence``). One setting at a time differs from the first one: learning rate, decay
-of the average, steps a frame, training paths, training before the first frame, where paths end, how the sun turns.
+of the average, steps a frame, training paths, training before the first frame, where paths end, how the sun turns, and
+of the blend alone κ (0.001: the plain mean of both).
 Direct light is measured with 1, 4 and 16 samples a pixel and without noise: the layers ``direct.*`` of other frames of
 the same state are further samples.
 
@@ -36,13 +37,15 @@ TURN, SLOWLY = 150.0, 15.0
 DIRECT = (1, 4, 16)
 #: Setting -> keys of all methods, changes of `Settings`. "" is the one that the others differ from.
 VARIANTS: dict[str, tuple[dict, dict]] = {
-    "": ({}, {}),
+    "": ({}, {}),  # measured first: others take records from it
     "train_samples=1024": ({"train_samples": 1024}, {}),
     "learning_rate=0.04": ({"learning_rate": 0.04}, {}),
     "1000 frames before, train_samples=1024": ({"train_samples": 1024}, {"pretrain": 1000}),
     "train_steps=4": ({"train_steps": 4}, {}),
     "learning_rate=0.0025": ({"learning_rate": 0.0025}, {}),
     "ema_decay=0.9": ({"ema_decay": 0.9}, {}),
+    "reliability_kappa=0.001": ({"reliability_kappa": 0.001}, {"methods": ("blend",)}),
+    "reliability_kappa=32": ({"reliability_kappa": 32.0}, {"methods": ("blend",)}),
     "turns by 15 degrees in every third frame": ({}, {}),
     "ends by default": ({"termination": None, "spread_threshold": None}, {}),
 }
@@ -82,22 +85,25 @@ def flip_sums(found: Measured, method: str, samples: tuple[int, ...], bar) -> di
     return {f"flip_{n}": float(value) for n, value in sums.items()}
 
 
-def records_of(work: Work, found: Measured, name: str, slow: bool) -> list[dict]:
-    """A record for each method of one setting."""
+def records_of(work: Work, found: Measured, name: str, slow: bool, before: list[dict]) -> list[dict]:
+    """A record for each method of one setting. Those of the first setting, in `before`, stand for methods that were not
+    rendered, as κ says nothing to them."""
     group = work.group("blend", {"setting": name, **asdict(found.settings)})
     samples = DIRECT[:1] if slow else DIRECT  # a state of the slow turn has three frames
-    records = {}
+    first = [record for record in before if not record["setting"] and record["method"] in ("High-LR", "EMA")]
+    records = {record["method"]: {**record, "setting": name} for record in first}
     for method in found.settings.methods:
         numbers = group.part(method.replace(" ", "_"), lambda bar, m=method: Part(flip_sums(found, m, samples, bar)))
         numbers = {"flip": float(np.sum(found.curves[method]["flip"][CHANGE:])), **numbers.numbers}
         _, weights = found.statistic(method, "reliability")
-        before, _, late = found.windows(method, "smape")
+        steady, _, late = found.windows(method, "smape")
         records[method] = {"setting": name, "method": method, **numbers}
-        records[method] |= {"smape_before": before, "smape_late": late}
+        records[method] |= {"smape_before": steady, "smape_late": late}
         if weights:
             records[method] |= {"weight_before": float(np.mean(weights[:CHANGE])),
                                 "weight_late": float(np.mean(weights[found.late :]))}  # fmt: skip
-    better = {key: min(records["High-LR"][key], records["EMA"][key]) for key in ("flip", "flip_1", "smape_late")}
+    both, compared = [records["High-LR"], records["EMA"]], ("flip", *(f"flip_{n}" for n in samples), "smape_late")
+    better = {key: min(record[key] for record in both) for key in compared}
     for record in records.values():
         record["over_better"] = {key: 100 * (record[key] / value - 1) for key, value in better.items()}
     return list(records.values())
@@ -123,10 +129,10 @@ def main(arguments: list[str] | None = None) -> int:
             common = {k: v for k, v in (changed.COMMON | keys).items() if v is not None}
             work = Work(options.output, progress=bars)
             change = change_of(options.scene, options.key, name == SLOW)
-            methods = tuple(changed.METHODS)[: 3 if name else 4]
-            found = changed.measure(work, replace(settings, methods=methods, **more), change, common)
-            records += records_of(work, found, name, name == SLOW)
-            for record in records[-len(methods) :]:
+            more = {"methods": tuple(changed.METHODS)[: 3 if name else 4], **more}
+            found = changed.measure(work, replace(settings, **more), change, common)
+            records += records_of(work, found, name, name == SLOW, records)
+            for record in (record for record in records if record["setting"] == name):
                 print({k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in record.items()}, flush=True)
             report = {"environment": environment.describe(), "scene": options.scene, "records": records}
             exr.write_text(options.output / "results.json", json.dumps(report, indent=1) + "\n")
