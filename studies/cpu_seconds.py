@@ -2,9 +2,10 @@
 
 For machines that other programs share: what they take does not count. Kernels are compiled before; Dr.Jit works with
 one thread, as threads that wait for work count as work. Integrators take turns, one repeat after another. The
-reference is rendered by ``plain_path`` with ``tree_lights`` at the depth that ``-D max_depth=`` gives, and kept in DIR.
-Prints and writes to DIR/results.json medians over the repeats, and how many times less trimmed relMSE each has than the
-first one (geometric mean over the repeats).
+reference is rendered by ``--reference``, an unbiased integrator, with the keys that ``-D`` gives, and kept in DIR; its
+own noise is measured and taken off the squared errors. ``noise`` in DIR/results.json says how much that is.
+Prints and writes to DIR/results.json, a record for each, medians over the repeats, and how many times less trimmed
+relMSE each has than the first one: geometric mean, least and most of the repeats.
 """
 
 from __future__ import annotations
@@ -50,15 +51,17 @@ def one_shot(scene, integrator, seconds: float, seed: int) -> tuple[np.ndarray, 
     return total / n, {"spp": n, "first_pass": first}
 
 
-def reference(loaded, keys: dict, spp: int, path: Path) -> np.ndarray:
-    """The reference image, read where it is there."""
-    if not path.is_file():
-        spec = load.IntegratorSpec("plain_path", {**keys, "light_sampler.type": "tree_lights"})
-        integrator, _ = load.build_integrator(spec, loaded.carried)
-        seeds = [budget.pass_seed(0, budget.STREAM_REFERENCE, k) for k in range(max(1, spp // PASS))]
+def reference(loaded, text: str, keys: dict, spp: int, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The reference image and the variance of each of its values, read where they are there."""
+    if not path.is_file() or exr.read(path).layer("variance") is None:
+        spec = load.parse_integrator(text)
+        integrator, _ = load.build_integrator(load.IntegratorSpec(spec.type, {**keys, **spec.keys}), loaded.carried)
+        seeds = [budget.pass_seed(0, budget.STREAM_REFERENCE, k) for k in range(max(2, spp // PASS))]
         images = [budget.render_pass(loaded.scene, integrator, PASS, s)[..., :3].astype(np.float64) for s in seeds]
-        exr.write(path, np.mean(images, axis=0))
-    return exr.read(path).rgb
+        variance = np.var(images, axis=0, ddof=1) / len(images)
+        exr.write(path, np.mean(images, axis=0), exr.layer_channels("variance", variance))
+    found = exr.read(path)
+    return found.rgb, found.layer("variance")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -70,6 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", default="160x90")
     parser.add_argument("--seconds", type=float, default=20.0, help="CPU seconds of an image")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--reference", default="plain_path:light_sampler.type=tree_lights", help="TYPE[:K=V,...]")
     parser.add_argument("--reference-spp", type=int, default=4096)
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("-o", "--output", type=Path, required=True)
@@ -80,7 +84,9 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     keys = load.parse_keys(options.define, "-D")
     loaded = load.load_scene(options.scene, terminal.parse_size(options.size))
-    known = reference(loaded, keys, options.reference_spp, options.output / "reference.exr")
+    path = options.output / "reference.exr"
+    known, variance = reference(loaded, options.reference, keys, options.reference_spp, path)
+    noise = float(metrics.relative_squared_errors(known, known, variance)[1].mean())
     dr.set_thread_count(1)
     cases = {}
     for text in options.integrator:
@@ -91,16 +97,18 @@ def main(arguments: list[str] | None = None) -> int:
     for repeat in range(options.repeats):
         for text, integrator in cases.items():
             image, facts = one_shot(loaded.scene, integrator, options.seconds, repeat + 1)
-            facts |= {"relmse_trimmed": metrics.relmse_trimmed(image, known), "flip": metrics.flip(image, known).mean}
+            error = metrics.relmse_trimmed(image, known, variance)
+            facts |= {"relmse_trimmed": error, "flip": metrics.flip(image, known).mean}
             rows[text].append(facts)
             print(repeat, text, {k: float(f"{v:.4g}") for k, v in facts.items()}, flush=True)
-    first, found = rows[options.integrator[0]], {}
+    first, records = rows[options.integrator[0]], []
     for text, own in rows.items():
-        found[text] = {k: float(np.median([row[k] for row in own])) for k in own[0]}
+        found = {k: float(np.median([row[k] for row in own])) for k in own[0]}
         ratios = [a["relmse_trimmed"] / b["relmse_trimmed"] for a, b in zip(first, own, strict=True)]
-        found[text]["times_less"] = float(np.exp(np.mean(np.log(ratios))))
-        print(text, {k: float(f"{v:.4g}") for k, v in found[text].items()})
-    report = {"environment": environment.describe(), "seconds": options.seconds, "results": found}
+        found |= {"times_less": float(np.exp(np.mean(np.log(ratios)))), "least": min(ratios), "most": max(ratios)}
+        print(text, {k: float(f"{v:.4g}") for k, v in found.items()})
+        records.append({"label": text, "scene": loaded.name, **found})
+    report = {"environment": environment.describe(), "seconds": options.seconds, "noise": noise, "records": records}
     exr.write_text(options.output / "results.json", json.dumps(report, indent=1) + "\n")
     return 0
 

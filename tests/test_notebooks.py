@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / "notebooks").glob("*.ipynb"))
 NAMES = ["00_quickstart", "01_inside_the_cache", "02_where_to_stop", "03_unbiased_anyway", "04_incident_or_outgoing",
          "05_many_lights", "06_moving_light", "07_measure_honestly", "08_your_own_cache",
-         "09_gradients", "10_fog"]  # fmt: skip
+         "09_gradients", "10_fog", "11_your_own_renderer"]  # fmt: skip
 LARGEST = 500_000  # bytes of a file
 
 each = pytest.mark.parametrize("file", FILES, ids=[f.stem for f in FILES])

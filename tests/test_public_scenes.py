@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mi_neural import cli, scenes
-from mi_neural.bench import fetch, load
+from mi_neural.bench import checksums, fetch, load
 from mi_neural.bench.load import InputError
 from mi_neural.scenes import public
 
@@ -214,7 +214,76 @@ def test_later_archive_is_compared_with_the_first(server, store):
     assert done.exit_code == 2 and "has changed" in done.output and SHA256 in done.output
     assert not (store / "veach-ajar").exists()
     assert run("scenes", "get", "veach-ajar", "--from", server.url, "--accept").exit_code == 0
-    assert fetch.remembered("veach-ajar")["sha256"] == hashlib.sha256(server.data).hexdigest() != SHA256
+    assert checksums.remembered("veach-ajar")["sha256"] == hashlib.sha256(server.data).hexdigest() != SHA256
+
+
+# ---------------------------------------------------------------- checksums of files
+
+
+@pytest.fixture
+def known(monkeypatch):
+    """Known files of veach-ajar: those of `ARCHIVE`'s texture, of another file that it lacks, and of a conversion."""
+    facts = lambda data: [len(data), hashlib.sha256(data).hexdigest()]  # noqa: E731
+    lists = {"copies": ["a/b", "c/d"], "published": {"textures/a.bin": facts(bytes(range(256)) * 8192),
+                                                   "models/b.obj": facts(b"v 0 0 0")},
+             "measured": {"scene.xml": facts(XML.encode()), "meshes/c.ply": facts(b"ply")}}  # fmt: skip
+    monkeypatch.setattr(checksums, "_lists", lambda: {"veach-ajar": lists})
+
+
+def test_files_of_an_archive_are_compared_with_known_ones(server, store, known):
+    done = run("scenes", "get", "veach-ajar", "--from", server.url)
+    assert "1 of 2 known files are there, byte for byte as those of public copies of the archive" in done.stdout
+    assert "not known: scene.xml" in done.stdout
+    assert "checksums of 2 of its files (2.1 MB) and 2 of the files of our conversion" in run("scenes").stdout
+
+
+def test_archive_with_another_file_of_a_known_name_is_refused(server, store, known):
+    server.data = zipped({"scene_v3.xml": XML, "textures/a.bin": b"another"})
+    done = run("scenes", "get", "veach-ajar", "--from", server.url)
+    assert done.exit_code == 2 and "files of veach-ajar are not those of public copies" in done.output
+    assert "textures/a.bin" in done.output and not (store / "veach-ajar").exists() and left(store) == []
+    assert checksums.remembered("veach-ajar") is None, "what was refused is no measure of later ones"
+    taken = run("scenes", "get", "veach-ajar", "--from", server.url, "--accept")
+    assert taken.exit_code == 0 and "different: textures/a.bin" in taken.stdout
+    check = run("scenes", "check")
+    assert check.exit_code == 2 and "files of veach-ajar are not the known ones" in check.output
+
+
+def test_converted_scene_is_known_as_what_was_measured(store, known, tmp_path):
+    folder = tmp_path / "mirror/veach-ajar"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "scene.xml").write_text(XML)
+    (folder / "meshes/c.ply").write_bytes(b"ply")
+    (folder / "reference_4x4.exr").write_bytes(b"")
+    done = run("scenes", "get", "veach-ajar", "--from", str(tmp_path / "mirror"))
+    assert "2 of 2 known files are there, byte for byte as those that the tables were measured on" in done.stdout
+    assert run("scenes", "check").exit_code == 0 == run("scenes", "check", "veach-ajar").exit_code
+    (store / "veach-ajar/meshes/c.ply").write_bytes(b"plx")
+    assert checksums.compare("veach-ajar", store / "veach-ajar").differing == ["meshes/c.ply"]
+
+
+def test_scene_that_is_not_here_cannot_be_checked(store):
+    assert run("scenes", "check").exit_code == 0
+    done = run("scenes", "check", "veach-ajar")
+    assert done.exit_code == 2 and "type mi-neural scenes get veach-ajar" in done.output
+
+
+def test_known_files_of_every_scene_of_the_tables():
+    for name, scene in public.SCENES.items():
+        measured, published = checksums.files(name, "measured"), checksums.files(name, "published")
+        assert {f"{file}.xml" for file in scene.files} <= set(measured)
+        assert bool(published) == bool(scene.url) and (len(checksums.copies(name)) > 1) == bool(scene.url)
+        for path, (size, sha256) in (measured | published).items():
+            assert size > 0 and re.fullmatch("[0-9a-f]{64}", sha256) and not path.startswith(("/", ".")), path
+
+
+@pytest.mark.parametrize("name", public.SCENES)
+def test_scene_on_this_machine_has_known_files(name):
+    folder = public.folder() / name
+    if not folder.is_dir():
+        pytest.skip(f"needs a public scene; type mi-neural scenes get {name}")
+    found = checksums.compare(name, folder)
+    assert found.same and not found.differing, found.text
 
 
 # ---------------------------------------------------------------- archives that are refused

@@ -105,6 +105,7 @@ def test_quick_counterpart_shows_both_numbers(tmp_path, monkeypatch):
         for s in found["statements"]:
             assert all(html.escape(s[key]) in page for key in ("paper", "where", "ours", "verdict"))
     assert "training" not in shown.stderr, "the second figure takes the first one's frames"
+    assert len(list((tmp_path / "measured").glob("states-*"))) == 1, "both settings have the same references"
     found = json.loads((tmp_path / "reliability/fig4/results.json").read_text())
     flip = {line[0]: [float(v) for v in line[1:4]] for line in found["tables"]["Means over the frames"][1:]}
     assert all(before < after for before, after, _ in flip.values()), "a moved lamp makes every cache wrong"

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "mi_neural", "integrators", "emitters", "scenes")
 #: What is no module, and must be in the wheel: suffixes by folder of the package.
 DATA = {"mi_neural/manual": (".md", ".png"), "mi_neural/lights": (".npz",), "mi_neural/bench": (".css", ".js"),
-        "scenes": (".xml", ".exr")}  # fmt: skip
+        "scenes": (".xml", ".exr", ".json")}  # fmt: skip
 
 
 def run(*words, folder: Path, **variables) -> str:

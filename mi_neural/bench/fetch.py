@@ -3,7 +3,7 @@
 The folder of the scenes holds complete scenes only: a scene is unpacked beside it and then moved there. An archive that
 was fetched in part is kept, and the same call goes on from there if the server can and its file has not changed.
 Archives are checked against the checksum in the catalogue; where none is known, against the one that was found the
-first time.
+first time. Their files are checked against those that are known, see :mod:`.checksums`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ import contextlib
 import datetime
 import difflib
 import errno
-import hashlib
 import http.client
-import json
 import os
 import re
 import shutil
@@ -32,13 +30,14 @@ from pathlib import Path, PurePosixPath
 from mi_neural import scenes
 from mi_neural.scenes import public
 
+from . import checksums
+from .checksums import BLOCK
 from .load import InputError
 
 Progress = Callable[[float, float | None], None]
 SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2")
 #: Seconds without an answer after which a server counts as silent.
 SILENCE = 30
-BLOCK = 1 << 18
 #: Upper bound of what an archive unpacks to, in bytes: larger ones are damaged or meant to fill the disk.
 MOST_BYTES = 8 << 30
 
@@ -46,12 +45,13 @@ MOST_BYTES = 8 << 30
 @dataclass
 class Found:
     """A scene that was got. `sha256`: of its archive, None where it came as a folder; `new`: nothing was known to
-    compare it with."""
+    compare it with; `files`: its files beside the known ones, None where it was there before."""
 
     name: str
     folder: Path
     sha256: str | None = None
     new: bool = False
+    files: checksums.Compared | None = None
 
 
 def entry(name: str) -> tuple[str, public.Public]:
@@ -73,7 +73,7 @@ def get(name: str, source: str | None = None, progress: Progress | None = None, 
     source    a folder that holds the scene's folder or archive, an archive, or the address of an archive or of a
               folder with it (http or https); None: the scene's own address
     progress  is called with the bytes that came, and all of them where the server says how many
-    accept    take an archive whose checksum differs from that of an earlier one
+    accept    take an archive whose checksum differs from that of an earlier one, and files that differ from known ones
 
     Raises :class:`InputError` where it cannot be had, or is not what it should be; nothing is left half-made then.
     """
@@ -94,21 +94,21 @@ def get(name: str, source: str | None = None, progress: Progress | None = None, 
     else:
         archive = local(Path(source).expanduser(), name, scene)
     if archive.is_dir():
-        _install(name, scene, source, lambda new: shutil.copytree(archive, new, dirs_exist_ok=True))
-        return Found(name, target)
+        copied = _install(name, scene, source, accept, lambda new: shutil.copytree(archive, new, dirs_exist_ok=True))
+        return Found(name, target, files=copied)
     fetched = archive.parent == _parts()
     try:
-        sha256 = digest(archive)
+        sha256 = checksums.digest(archive)
         new = check(name, scene, sha256, accept)
-        _install(name, scene, source or scene.url, lambda new: unpack(archive, new), sha256)
+        files = _install(name, scene, source or scene.url, accept, lambda new: unpack(archive, new), sha256)
     except InputError:
         if fetched:  # complete, but not the right file: continuing it would not help
             _forget(archive)
         raise
-    remember(name, sha256, source or scene.url)
+    checksums.remember(name, sha256, source or scene.url)
     if fetched:
         _forget(archive)
-    return Found(name, target, sha256, new)
+    return Found(name, target, sha256, new, files)
 
 
 # ------------------------------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ def download(url: str, part: Path, progress: Progress | None = None) -> Path:
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     state = part.with_suffix(".json")
-    known = _read(state)
+    known = checksums.read_json(state)
     start = part.stat().st_size if part.is_file() and known.get("url") == url and known.get("tag") else 0
     headers = {"Range": f"bytes={start}-", "If-Range": known["tag"]} if start else {}
     try:
@@ -153,7 +153,7 @@ def download(url: str, part: Path, progress: Progress | None = None) -> Path:
             sent = answer.headers.get("Content-Range", "")
             start = start if answer.status == 206 and sent.startswith(f"bytes {start}-") else 0  # else it sends all
             tag = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
-            _write(state, {"url": url, "tag": None if tag and tag.startswith("W/") else tag})
+            checksums.write_json(state, {"url": url, "tag": None if tag and tag.startswith("W/") else tag})
             length = answer.headers.get("Content-Length")
             total = None if length is None else start + int(length)
             done = _receive(answer, part, start, total, progress)
@@ -193,15 +193,6 @@ def _stopped(url: str, part: Path, why) -> str:
 # Whether it is what it should be
 
 
-def digest(file: Path) -> str:
-    """SHA-256 of a file."""
-    found = hashlib.sha256()
-    with open(file, "rb") as data:
-        while block := data.read(BLOCK):
-            found.update(block)
-    return found.hexdigest()
-
-
 def check(name: str, scene: public.Public, sha256: str, accept: bool = False) -> bool:
     """Compare the checksum of an archive with the known one; returns whether none is known. Raises `InputError`."""
     if scene.sha256:
@@ -209,23 +200,11 @@ def check(name: str, scene: public.Public, sha256: str, accept: bool = False) ->
             raise InputError(f"the archive of {name} is not the one that is known: its SHA-256 is {sha256}, it should "
                              f"be {scene.sha256}")  # fmt: skip
         return False
-    before = remembered(name)
+    before = checksums.remembered(name)
     if before and before["sha256"] != sha256 and not accept:
         raise InputError(f"the archive of {name} has changed: its SHA-256 is {sha256}, that of {before['from']} was "
                          f"{before['sha256']} on {before['date']}; add --accept if you want the new one")  # fmt: skip
     return before is None or before["sha256"] != sha256
-
-
-def remembered(name: str) -> dict | None:
-    """The checksum of the archive that was got last: `sha256`, `from` and `date`; None: there was none."""
-    found = _read(_checksums()).get(name)
-    return found if isinstance(found, dict) and {"sha256", "from", "date"} <= set(found) else None
-
-
-def remember(name: str, sha256: str, source: str) -> None:
-    """Keep the checksum of an archive, for later ones to be compared with."""
-    found = {"sha256": sha256, "from": str(source), "date": datetime.date.today().isoformat()}
-    _write(_checksums(), {**_read(_checksums()), name: found})
 
 
 # ------------------------------------------------------------------------------------------------------------------
@@ -269,9 +248,9 @@ def _refuse_large(archive: Path, size: int) -> None:
 
 
 def _install(
-    name: str, scene: public.Public, source, fill: Callable[[Path], object], sha256: str | None = None
-) -> None:  # fmt: skip
-    """Have `fill` write the scene into a folder beside its place, check it, and move it there."""
+    name: str, scene: public.Public, source, accept: bool, fill: Callable[[Path], object], sha256: str | None = None
+) -> checksums.Compared:  # fmt: skip
+    """Have `fill` write the scene into a folder beside its place, check it and its files, and move it there."""
     with _temporary(public.folder()) as new:
         fill(new)
         root = _root(new, scene)
@@ -279,9 +258,14 @@ def _install(
             raise InputError(f"{source} holds no {scene.main} or {', '.join(f'{file}.xml' for file in scene.files)}")
         if not (root / "scene.xml").exists() and (root / scene.main).is_file():
             os.replace(root / scene.main, root / "scene.xml")
+        compared = checksums.compare(name, root)
+        if compared.differing and not accept:
+            raise InputError(f"files of {name} are not those {checksums.WORDS[compared.which]}: "
+                             f"{checksums.several(compared.differing)}; add --accept if you want them")  # fmt: skip
         facts = {"from": str(source), "sha256": sha256, "date": datetime.date.today().isoformat()}
-        _write(root / ".mi_neural.json", facts)
+        checksums.write_json(root / ".mi_neural.json", facts)
         os.replace(root, public.folder() / name)
+        return compared
 
 
 def _root(folder: Path, scene: public.Public) -> Path | None:
@@ -318,24 +302,6 @@ def _part(name: str) -> Path:
     return _parts() / f"{name}.part"
 
 
-def _checksums() -> Path:
-    return public.folder() / "checksums.json"
-
-
 def _forget(part: Path) -> None:
     for file in (part, part.with_suffix(".json")):
         file.unlink(missing_ok=True)
-
-
-def _read(file: Path) -> dict:
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-def _write(file: Path, what: dict) -> None:
-    new = file.with_name(f"{file.name}.{os.getpid()}")
-    new.write_text(json.dumps(what, indent=1) + "\n", encoding="utf-8")
-    os.replace(new, file)

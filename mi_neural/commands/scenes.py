@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from mi_neural import scenes as shipped
-from mi_neural.bench import fetch, terminal
+from mi_neural.bench import checksums, fetch, terminal
+from mi_neural.bench.load import InputError
 from mi_neural.commands import options
 from mi_neural.scenes import public
 
@@ -23,7 +24,6 @@ def list_(context: typer.Context) -> None:
     """
     if context.invoked_subcommand:
         return
-    show = lambda text: terminal.out.print(text, soft_wrap=True, markup=False, highlight=False)  # noqa: E731
     show(f"Shipped: {', '.join(shipped.names())}")
     show(f"\nPublic, in {public.folder()}:")
     for name, scene in public.SCENES.items():
@@ -33,8 +33,8 @@ def list_(context: typer.Context) -> None:
         show(f"\n{', '.join(of_it)}: {'here' if here else f'not here; type {wanted}'}")
         show(f"    '{scene.title}' by {scene.author}; {scene.licence}")
         size = "size not known" if scene.size is None else f"{scene.size / 1e6:.1f} MB"
-        sha256 = known_checksum(name, scene)
-        show(f"    {f'{scene.url}, {size}, {sha256}' if scene.url else 'no public archive'}")
+        known = f"{size}, {known_checksum(name, scene)}"
+        show(f"    {f'{scene.url}, {known}' if scene.url else 'no public archive'}; {known_files(name)}")
         if scene.note:
             show(f"    {scene.note}")
 
@@ -43,9 +43,23 @@ def known_checksum(name: str, scene: public.Public) -> str:
     """What is known of the checksum of an archive, in words."""
     if scene.sha256:
         return f"SHA-256 {scene.sha256}"
-    if found := fetch.remembered(name):
+    if found := checksums.remembered(name):
         return f"SHA-256 {found['sha256']} found {found['date']}"
-    return "no checksum known"
+    return "no checksum of it known"
+
+
+def known_files(name: str) -> str:
+    """How many files of a scene have a known checksum, and how large they are."""
+    words = {"published": "its files", "measured": "the files of our conversion"}
+    found = {of: checksums.files(name, which) for which, of in words.items()}
+    return "checksums of " + " and ".join(
+        f"{len(known)} of {of} ({sum(size for size, _ in known.values()) / 1e6:.1f} MB)" for of, known in found.items()
+        if known)  # fmt: skip
+
+
+def show(text: str) -> None:
+    """Print a line as it is, for a terminal of any width."""
+    terminal.out.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 @scenes.command()
@@ -57,7 +71,7 @@ def get(
         typer.Option("--from", metavar="FOLDER|URL", help="a folder, an archive or a mirror to get it from"),
     ] = None,
     accept: Annotated[
-        bool, typer.Option("--accept", help="take an archive that differs from the one got before")
+        bool, typer.Option("--accept", help="take an archive, or files, that differ from what is known")
     ] = False,
 ) -> None:
     """Get public scenes into the folder MI_NEURAL_SCENES, by default the user's cache.
@@ -71,5 +85,26 @@ def get(
             found = fetch.get(one, source, bars(f"getting {one}"), accept)
         if found.sha256:
             known = "no checksum was known before; later ones are compared with it" if found.new else "as expected"
-            terminal.out.print(f"SHA-256 {found.sha256}: {known}", soft_wrap=True, markup=False, highlight=False)
-        terminal.out.print(f"{found.name} is in {found.folder}", soft_wrap=True, markup=False, highlight=False)
+            show(f"SHA-256 {found.sha256}: {known}")
+        if found.files:
+            show(found.files.text)
+        show(f"{found.name} is in {found.folder}")
+        scene = public.SCENES[found.name]
+        show(f"'{scene.title}' by {scene.author}; {scene.licence}")
+
+
+@scenes.command()
+@options.readable
+def check(
+    name: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="public scenes; default: all here")] = None,
+) -> None:
+    """Compare the files of public scenes on this machine with the known checksums."""
+    wanted = [fetch.entry(one)[0] for one in name or public.SCENES]
+    here = [one for one in wanted if (public.folder() / one).is_dir()]
+    if missing := [one for one in wanted if name and one not in here]:
+        raise InputError(f"{missing[0]} is not on this machine: type mi-neural scenes get {missing[0]}")
+    found = {one: checksums.compare(one, public.folder() / one) for one in here}
+    for one, compared in found.items():
+        show(f"{one}: {compared.text}")
+    if different := [one for one, compared in found.items() if compared.differing]:
+        raise InputError(f"files of {', '.join(different)} are not the known ones")

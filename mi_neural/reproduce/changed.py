@@ -2,13 +2,15 @@
 
 A frame of one sample a pixel flickers by the noise of direct light far more than by the cache. That noise is the same
 for all predictors and hides what they differ in. So in each frame direct light is replaced by its mean over many
-samples in that state of the scene before anything is measured; all that the cache says stays as it is.
+samples in that state of the scene before anything is measured; all that the cache says stays as it is. References and
+direct light of a scene are rendered once for all settings of the integrators.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -88,6 +90,7 @@ def mean_reliabilities(integrator) -> dict[str, float]:
 class Measured:
     """Frames of all methods, as :func:`measure` found them.
 
+    direct  state of the scene (as `Sequence.states` has it) -> mean direct light, shape (height, width, 3)
     curves  method -> "flip" and "smape" -> a value for each frame (SMAPE of frame 0 is None); "flip 0" of crop 0
     crops   (x, y, width, height): where the change is strongest, and where it is weakest
     """
@@ -95,13 +98,13 @@ class Measured:
     settings: Settings
     run: sequence.Run
     results: dict[str, sequence.Result]
-    direct: list[np.ndarray]
+    direct: dict[str, np.ndarray]
     curves: dict[str, dict[str, list[float | None]]]
     crops: list[plots.Crop]
 
     def clean(self, method: str, frame: int) -> np.ndarray:
         """A frame with the mean of direct light in place of its sample, shape (height, width, 3)."""
-        return clean(self.results[method].image(frame), self.direct[frame >= CHANGE])
+        return clean(self.results[method].image(frame), self.direct[self.run.sequence.states[frame]])
 
     def reference(self, frame: int) -> np.ndarray:
         """The reference of a frame."""
@@ -139,15 +142,20 @@ def measure(work: Work, settings: Settings, change: Change, common: dict[str, ob
     """All methods over the frames of one scene; goes on where an earlier call was interrupted. `common`: keys of all
     methods."""
     facts = asdict(settings) | {"scene": change.scene, "change": change.what}
-    group = work.group(f"change-{change.scene}", facts if common == COMMON else facts | {"common": common})
+    name = Path(change.scene).name
+    group = work.group(f"change-{name}", facts if common == COMMON else facts | {"common": common})
+    of_scene = ("scene", "change", "size", "frames", "reference_spp")
+    still = work.group(f"states-{name}", {key: facts[key] for key in of_scene})
     loaded = load.load_scene(change.scene, settings.size, merge=False)
     over_time = sequence.Sequence(loaded.scene, change.functions, settings.frames, CHANGE)
     plan = sequence.Plan(settings.spp, settings.pretrain)
-    run = Watched(loaded, over_time, plan, group.folder / "frames", settings.reference_spp, progress=work.progress)
+    run = Watched(loaded, over_time, plan, group.folder / "frames", progress=work.progress)
+    run.references = sequence.References(loaded, over_time, settings.reference_spp, still.folder / "references")
     keys = {**common, "cache_samples": settings.cache_samples}
     specs = [IntegratorSpec("nirc", {**keys, **METHODS[m]}) for m in settings.methods]
     results = dict(zip(settings.methods, run.run(benchmark.make_cases(loaded, specs)), strict=True))
-    direct = [direct_light(group, loaded, over_time, settings, frame) for frame in (0, CHANGE)]
+    direct = {state: direct_light(still, loaded, over_time, settings, frame)
+              for state, frame in run.references.first.items()}  # fmt: skip
     found = Measured(settings, run, results, direct, {}, [])
     found.crops = plots.choose_crops(found.reference(CHANGE - 1), found.reference(CHANGE))
     found.curves = {m: group.part(f"errors_{m}", lambda bar, m=m: Part(_errors(found, m, bar))).numbers
