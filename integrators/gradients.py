@@ -21,6 +21,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural import parameters
 from mi_neural.caches.material import material_of
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators.base import as_seed
@@ -47,7 +48,7 @@ def moved(scene, params, lamps: bool = False) -> list[str]:
     names = []
     for key, (_, _, owner, *_) in params.properties.items():
         asked = isinstance(owner, mi.Shape) and owner.is_emitter() if lamps else isinstance(owner, mi.Shape | mi.Sensor)
-        value = params[key] if asked else None
+        value = parameters.read(params, key) if asked else None
         if value is not None and dr.grad_enabled(value) and not _is_attribute(key):
             names.append(key)
     return names
@@ -125,8 +126,8 @@ def _by_cache(integrator, scene, params, sensor) -> bool:
         )
     if by_cache and state.lights is not None and (dark := state.lights.table.n_dark()):
         state.say_once(
-            f"{plugin}: {dark} lamps without extent are black and get no gradient, as {integrator.light_sampler.plugin} "
-            "never chooses them; begin with a small positive value"
+            f"{plugin}: {dark} lamps without extent are black and get no gradient, as "
+            f"{integrator.light_sampler.plugin} never chooses them; begin with a small positive value"
         )
     return by_cache
 
@@ -242,8 +243,8 @@ def adjoint(integrator, mode, scene, lights, field, sampler, ray, δL, active):
 
         dL += β d[NEE + f/p (w L_e + L_i)],
 
-    with L_i from ``integrator.incident_radiance``; L_i, β, p, directions and MIS weights w are detached. `lights` chooses
-    the lights of NEE (None: the scene does).
+    with L_i from ``integrator.incident_radiance``; L_i, β, p, directions and MIS weights w are detached. `lights`
+    chooses the lights of NEE (None: the scene does). Rays are traced from black surfaces, too.
     """
     with dr.resume_grad():
         path = paths.camera_vertex(integrator, scene, mi.Ray3f(dr.detach(ray)), active)
@@ -258,7 +259,7 @@ def adjoint(integrator, mode, scene, lights, field, sampler, ray, δL, active):
         found, sampler = paths.bounce(
             scene, lights, path, sampler, numbers, bsdf=bsdf, direct=partial(paths.direct_light, attached=True),
             black=True,
-        )
+        )  # fmt: skip
         L_nee, Le = found.L_nee, found.Le
         found.L_nee, found.Le = mi.Spectrum(0), mi.Spectrum(0)
         after = paths.advance(path, found, integrator.depth_limit)

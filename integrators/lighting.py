@@ -83,8 +83,8 @@ class LightSamplingIntegrator(FilmIntegrator):
         if moving:
             self.lights = None
             self.film_state.say_once(
-                f"{self.plugin}: lights are chosen as Mitsuba does, without {self.light_sampler.plugin}, where gradients "
-                f"of their shapes are wanted: {', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
+                f"{self.plugin}: lights are chosen as Mitsuba does, without {self.light_sampler.plugin}, where "
+                f"gradients of their shapes are wanted: {', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
             )
         elif dark := self.lights.table.n_dark():
             self.film_state.say_once(

@@ -2,11 +2,12 @@
 
 The gradient is that of the mean of I / (I_0 + ε), I_0 being the image as it is: each pixel counts the same. It is taken
 with respect to all colours, textures and other numbers of BSDFs and emitters that move nothing. Independent gradients
-are made in turn by each integrator, and timed in seconds of the processors (on a GPU: of the clock), so that a change in
-the machine's load affects all of them alike; those with a cache are trained before, and not in between. Of each parameter (a texture is one) the variance of one gradient and the squared
-bias are taken relative to the squared norm of the reference, gradients by ``prb`` of many samples, whose own noise is
-subtracted. The efficiency is 1 / (variance x time), the first integrator's being 1: the geometric mean over the
-parameters of a kind. The error in a second is that of all parameters together, bias and noise, over their norm.
+are made in turn by each integrator, and timed in seconds of the processors (on a GPU: of the clock), so that a change
+in the machine's load affects all of them alike; those with a cache are trained before, and not in between. Of each
+parameter (a texture is one) the variance of one gradient and the squared bias are taken relative to the squared norm of
+the reference, gradients by ``prb`` of many samples, whose own noise is subtracted. The efficiency is 1 / (variance x
+time), the first integrator's being 1: the geometric mean over the parameters of a kind. The error in a second is that
+of all parameters together, bias and noise, over their norm.
 """
 
 from __future__ import annotations

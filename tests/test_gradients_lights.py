@@ -121,4 +121,3 @@ def test_predicted_direct_light_has_no_gradient():
     image = mi.render(scene, params, integrator=integrator, spp=1)
     with pytest.raises(RuntimeError, match="leave neural_depth out"):
         dr.backward(dr.mean(image, axis=None))
-
