@@ -252,9 +252,16 @@ class _FilmState:
         self.placed: tuple[int, int] | None = None  # see place_samples()
         self.nonfinite: list = []
         self.n_bound = self.n_forgotten = 0
+        self.said: set[str] = set()
         self.entered = False  # whether Mitsuba's own render() is under way, which calls sample()
         self._estimate = None
         self._records: bool | None = None
+
+    def say_once(self, text: str) -> None:
+        """Warn of something that holds from now on."""
+        if text not in self.said:
+            self.said.add(text)
+            mi.Log(mi.LogLevel.Warn, f"mi_neural: {text}")
 
     def estimate_of(self, integrator):
         """The integrator's `estimate`; held weakly, or a recording would keep the integrator alive."""

@@ -75,9 +75,14 @@ def check_lights_in_media(lights, plugin: str) -> None:
 
 def check_gradients_in_media(scene, plugin: str) -> None:
     """Refuse gradients in a scene with participating media, if derivatives with respect to it are wanted."""
-    params = mi.traverse(scene)
-    if any(dr.grad_enabled(value) for value in (parameters.read(params, key) for key in params.keys())):
+    if wants_gradients(scene):
         raise no_gradients_in_media(plugin)
+
+
+def wants_gradients(scene) -> bool:
+    """Whether derivatives with respect to a parameter of `scene` are wanted."""
+    params = mi.traverse(scene)
+    return any(dr.grad_enabled(value) for value in (parameters.read(params, key) for key in params.keys()))
 
 
 def no_gradients_in_media(plugin: str) -> RuntimeError:

@@ -415,10 +415,10 @@ class CacheIntegrator(LearningIntegrator):
     # -------------------------------------------------------------------------------------------------------------
     # Rendering
 
-    def incident_radiance(self, scene, field, path, found, after, sampler):
+    def incident_radiance(self, scene, lights, field, path, found, after, sampler):
         """Radiance, emission apart, that the ray of a bounce brings from `after` to `path`, by the cache; not
         differentiated: (Li, sampler)."""
-        return gradients.by_incident_cache(self, scene, field, path, found, after, sampler)
+        return gradients.by_incident_cache(self, scene, lights, field, path, found, after, sampler)
 
     render_forward, render_backward = gradients.render_forward, gradients.render_backward
 

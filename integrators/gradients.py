@@ -21,6 +21,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
+from mi_neural import parameters
 from mi_neural.caches.material import material_of
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators.base import as_seed
@@ -28,7 +29,7 @@ from mi_neural.integrators.checks import no_gradients_in_media
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import PACKET, PASS_SAMPLES, Area, Samples, camera_rays
-from mi_neural.render.frozen import LOCK, can_freeze, is_recording, undisturbed
+from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_lights, is_recording, undisturbed
 from mi_neural.render.media import media_of
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
@@ -38,13 +39,16 @@ GRADIENTS = ("cache", "prb")
 SALT = 0x3C6EF372
 
 
-def moved(scene, params) -> list[str]:
-    """Names of the shapes' and sensors' parameters that derivatives are wanted of: positions, normals, transforms."""
+def moved(scene, params, lamps: bool = False) -> list[str]:
+    """Names of the shapes' and sensors' parameters that derivatives are wanted of: positions, normals, transforms.
+
+    `lamps`: those of shapes that shine alone."""
     if not isinstance(params, mi.SceneParameters):
         params = mi.traverse(scene)
     names = []
     for key, (_, _, owner, *_) in params.properties.items():
-        value = params[key] if isinstance(owner, mi.Shape | mi.Sensor) else None
+        asked = isinstance(owner, mi.Shape) and owner.is_emitter() if lamps else isinstance(owner, mi.Shape | mi.Sensor)
+        value = parameters.read(params, key) if asked else None
         if value is not None and dr.grad_enabled(value) and not _is_attribute(key):
             names.append(key)
     return names
@@ -100,25 +104,32 @@ def _by_cache(integrator, scene, params, sensor) -> bool:
         raise no_gradients_in_media(plugin)
     if integrator.channels:
         state.say_once(f"{plugin}: the channels {', '.join(integrator.channels)} have no gradient")
-    if integrator.nested_sampler is not None or state.lights is not None:
+    moving = []
+    if integrator.gradient != "prb":
+        with dr.resume_grad():
+            moving = moved(scene, params)
+        if moving:
+            state.say_once(
+                f"{plugin}: gradients come from prb, because the cache has none of shapes and sensors: "
+                f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
+            )
+        elif not state.bound.knows(scene) or (integrator.needs_cache and integrator.cache.field is None):
+            integrator.bind(scene, sensor)
+        elif integrator.light_sampler is not None:
+            state.lights = integrator.light_sampler.lights(scene, sensor, train=False)  # they may have changed
+    by_cache = integrator.gradient != "prb" and not moving and integrator.needs_cache
+    if not by_cache and (integrator.nested_sampler is not None or state.lights is not None):
         name = getattr(integrator.light_sampler, "plugin", "a light sampler")
         state.say_once(
-            f"{plugin}: gradients choose lights as Mitsuba does, without {name}; where that is wrong (mi-neural doc "
-            "limits) they are wrong, too"
+            f"{plugin}: gradients by prb choose lights as Mitsuba does, without {name}; where that is wrong (mi-neural "
+            "doc limits) they are wrong, too"
         )
-    if integrator.gradient == "prb":
-        return False
-    with dr.resume_grad():
-        moving = moved(scene, params)
-    if moving:
+    if by_cache and state.lights is not None and (dark := state.lights.table.n_dark()):
         state.say_once(
-            f"{plugin}: gradients come from prb, because the cache has none of shapes and sensors: "
-            f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
+            f"{plugin}: {dark} lamps without extent are black and get no gradient, as "
+            f"{integrator.light_sampler.plugin} never chooses them; begin with a small positive value"
         )
-        return False
-    if not state.bound.knows(scene) or (integrator.needs_cache and integrator.cache.field is None):
-        integrator.bind(scene, sensor)
-    return integrator.needs_cache
+    return by_cache
 
 
 # -----------------------------------------------------------------------------------------------------------------
@@ -131,20 +142,23 @@ def backward(integrator, scene, grad_in, sensor, seed, spp: int) -> None:
     `grad_in`: a tensor of the image's shape. `seed`: a ``mi.UInt32``. `spp`: samples a pixel.
     """
     area = Area.of(sensor)
-    for first, n in _passes(area, spp):
-        samples, n_lanes = _samples(area, seed, first, n)
-        place, active = _places(area, samples, n_lanes)
-        with dr.resume_grad():
-            δL = dr.zeros(mi.Spectrum, n_lanes)
-            dr.enable_grad(δL)
-            image = _image(integrator, sensor, [(place, δL, active)])
-            dr.set_grad(image, grad_in * (n / spp))
-            dr.enqueue(dr.ADMode.Backward, image)
-            dr.traverse(dr.ADMode.Backward)
-            δL = dr.grad(δL)
-        dr.eval(δL)
-        _trace_pass(integrator, dr.ADMode.Backward, scene, sensor, area, samples, n_lanes, δL)
-        dr.eval()
+    # What the scene computes from its parameters (an environment map) is left for the end: its derivatives would go on
+    # to them once, and those of later parts of a path or of later passes would be lost
+    with dr.isolate_grad():
+        for first, n in _passes(area, spp):
+            samples, n_lanes = _samples(area, seed, first, n)
+            place, active = _places(area, samples, n_lanes)
+            with dr.resume_grad():
+                δL = dr.zeros(mi.Spectrum, n_lanes)
+                dr.enable_grad(δL)
+                image = _image(integrator, sensor, [(place, δL, active)])
+                dr.set_grad(image, grad_in * (n / spp))
+                dr.enqueue(dr.ADMode.Backward, image)
+                dr.traverse(dr.ADMode.Backward)
+                δL = dr.grad(δL)
+            dr.eval(δL)
+            _trace_pass(integrator, dr.ADMode.Backward, scene, sensor, area, samples, n_lanes, δL)
+            dr.eval()
 
 
 def forward(integrator, scene, sensor, seed, spp: int):
@@ -196,18 +210,19 @@ def _trace_pass(integrator, mode, scene, sensor, area: Area, samples: Samples, n
     """Adjoint paths of one pass, by a recorded function where that is possible; their derivatives in forward mode."""
     held = weakref.ref(integrator)  # or a recording would keep the integrator alive
 
-    def trace_pass(scene, sensor, field, samples, δL):
+    def trace_pass(scene, sensor, lights, field, samples, δL):
         pixel, sample, active = samples.lanes(area, n_lanes)
         ray, weight, _, sampler = camera_rays(sensor, area, pixel, samples.sampler(pixel, sample, SALT))
         δL = dr.zeros(mi.Spectrum, n_lanes) if δL is None else δL * weight
         ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
-        δL = adjoint(held(), mode, scene, field, sampler, ray, δL, active)
+        δL = adjoint(held(), mode, scene, lights, field, sampler, ray, δL, active)
         return δL * weight if mode == dr.ADMode.Forward else None
 
-    arguments = scene, sensor, integrator.bound_field, samples, δL
+    arguments = scene, sensor, integrator.bound_lights, integrator.bound_field, samples, δL
     state = integrator.film_state
     records = mode == dr.ADMode.Backward and integrator.records and not is_recording()
-    if not (records and state.scene_records(scene) and can_freeze(sensor)):
+    lit = integrator.bound_lights is not None or can_freeze_lights(scene)
+    if not (records and lit and state.scene_records(scene) and can_freeze(sensor)):
         return trace_pass(*arguments)
     limits = integrator.max_depth, integrator.rr_depth, integrator.hide
     key = ("adjoint", area, n_lanes, sensor.class_name(), *limits)
@@ -220,7 +235,7 @@ def _trace_pass(integrator, mode, scene, sensor, area: Area, samples: Samples, n
 # Along a path
 
 
-def adjoint(integrator, mode, scene, field, sampler, ray, δL, active):
+def adjoint(integrator, mode, scene, lights, field, sampler, ray, δL, active):
     """Carry derivatives along camera paths: in backward mode `δL`, that of the radiance of each path, to the scene's
     parameters; in forward mode theirs to the radiance, which is returned.
 
@@ -228,11 +243,12 @@ def adjoint(integrator, mode, scene, field, sampler, ray, δL, active):
 
         dL += β d[NEE + f/p (w L_e + L_i)],
 
-    with L_i from ``integrator.incident_radiance``; L_i, β, p, directions and MIS weights w are detached.
+    with L_i from ``integrator.incident_radiance``; L_i, β, p, directions and MIS weights w are detached. `lights`
+    chooses the lights of NEE (None: the scene does). Rays are traced from black surfaces, too.
     """
     with dr.resume_grad():
         path = paths.camera_vertex(integrator, scene, mi.Ray3f(dr.detach(ray)), active)
-        δL = _carry(mode, path.L, δL)
+        δL = _carry(mode, path.L, δL, keep=True)
     path.L = dr.zeros(mi.Spectrum, dr.width(ray))
     numbers_first = paths.stratified(sampler)
 
@@ -241,13 +257,14 @@ def adjoint(integrator, mode, scene, field, sampler, ray, δL, active):
         numbers, sampler = paths.draw_numbers(sampler)
         numbers = dr.select(path.depth == 1, numbers_first, numbers)
         found, sampler = paths.bounce(
-            scene, None, path, sampler, numbers, bsdf=bsdf, direct=partial(paths.direct_light, attached=True)
-        )
+            scene, lights, path, sampler, numbers, bsdf=bsdf, direct=partial(paths.direct_light, attached=True),
+            black=True,
+        )  # fmt: skip
         L_nee, Le = found.L_nee, found.Le
         found.L_nee, found.Le = mi.Spectrum(0), mi.Spectrum(0)
         after = paths.advance(path, found, integrator.depth_limit)
 
-        Li, sampler = integrator.incident_radiance(scene, field, path, found, after, sampler)
+        Li, sampler = integrator.incident_radiance(scene, lights, field, path, found, after, sampler)
         per_pdf = dr.select(found.followed & (found.bs.pdf > 0), dr.rcp(found.bs.pdf), 0)
         with dr.resume_grad():
             f = bsdf.eval(mi.BSDFContext(), si, found.bs.wo, found.followed)
@@ -262,18 +279,19 @@ def adjoint(integrator, mode, scene, field, sampler, ray, δL, active):
     )[1]
 
 
-def _carry(mode, L, δL):
+def _carry(mode, L, δL, keep: bool = False):
     """Carry derivatives between radiance `L` and the parameters that it depends on: `δL`, in forward mode with those
-    of `L` added."""
+    of `L` added. `keep`: leave those of the parameters as they are, for another call; inside of loops they stay anyway.
+    """
     if not dr.grad_enabled(L):
         return δL
     if mode == dr.ADMode.Forward:
-        return δL + dr.forward_to(L)
+        return δL + dr.forward_to(L, flags=dr.ADFlag.ClearInterior if keep else dr.ADFlag.Default)
     dr.backward_from(δL * L)
     return δL
 
 
-def by_incident_cache(integrator, scene, field, path, found, after, sampler):
+def by_incident_cache(integrator, scene, lights, field, path, found, after, sampler):
     """Radiance, emission apart, that the ray of a bounce brings to `path`, from a cache of incident radiance:
     (Li, sampler).
 
@@ -293,7 +311,7 @@ def by_incident_cache(integrator, scene, field, path, found, after, sampler):
         return Li, sampler
 
     def step(path, sampler):
-        found, sampler = paths.bounce(scene, None, path, sampler)
+        found, sampler = paths.bounce(scene, lights, path, sampler)
         after = paths.advance(path, found, integrator.depth_limit)
         ends = vertex.is_terminal(path.si, path.active) & ~found.delta & (found.bs.pdf <= SHARP_PDF)
         beyond = query(path, found, ends)
@@ -306,7 +324,7 @@ def by_incident_cache(integrator, scene, field, path, found, after, sampler):
     return Li + path.L, sampler
 
 
-def by_outgoing_cache(integrator, scene, field, content: str, after, sampler):
+def by_outgoing_cache(integrator, scene, lights, field, content: str, after, sampler):
     """The same from a cache of outgoing radiance, which is read where the ray arrived, at `after`.
 
     Mirrors, glass and masks are traced on to the first surface that the cache knows; so is direct light there if the
@@ -315,7 +333,7 @@ def by_outgoing_cache(integrator, scene, field, content: str, after, sampler):
     path = replace(after, L=mi.Spectrum(0), β=mi.Spectrum(1), η=mi.Float(1))
 
     def step(path, sampler):
-        found, sampler = paths.bounce(scene, None, path, sampler)
+        found, sampler = paths.bounce(scene, lights, path, sampler)
         path = paths.advance(path, found, integrator.depth_limit)
         return paths.roulette(path, sampler, integrator.rr_depth)
 
@@ -325,7 +343,7 @@ def by_outgoing_cache(integrator, scene, field, content: str, after, sampler):
     if paths.scene_has_mirrors(scene) or _scene_has_masks(scene):
         path, sampler = dr.while_loop((path, sampler), passes_on, step, label="mirrors and masks")
     if content == "indirect":
-        found, sampler = paths.bounce(scene, None, path, sampler)
+        found, sampler = paths.bounce(scene, lights, path, sampler)
         path.L += dr.select(path.active, path.β * found.direct, 0)
     bsdf = path.si.bsdf(path.ray)
     surface = surface_of(path.si, bsdf, path.active, scene_is_glossy(scene))

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import check_scene, sensor_of
+from mi_neural.integrators.gradients import moved
 from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
@@ -59,7 +60,7 @@ class LightSamplingIntegrator(FilmIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if self.film_state.entered:  # Mitsuba's own render() comes back here once
             return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
-        if not (self.differentiable and _differentiates()):
+        if not (self.differentiable and differentiates()):
             return super().render(scene, sensor, seed, spp, develop, evaluate)
         sensor = self._checked(scene, sensor, spp)
         with LOCK:
@@ -75,7 +76,21 @@ class LightSamplingIntegrator(FilmIntegrator):
             return image
 
     def check_gradients(self, scene) -> None:
-        """Refuse what cannot be rendered with gradients in the scene that is bound."""
+        """Refuse what cannot be rendered with gradients in the scene that is bound; what is left out is said once."""
+        if self.lights is None:
+            return
+        moving = moved(scene, mi.traverse(scene), lamps=True)
+        if moving:
+            self.lights = None
+            self.film_state.say_once(
+                f"{self.plugin}: lights are chosen as Mitsuba does, without {self.light_sampler.plugin}, where "
+                f"gradients of their shapes are wanted: {', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
+            )
+        elif dark := self.lights.table.n_dark():
+            self.film_state.say_once(
+                f"{self.plugin}: {dark} lamps without extent are black and get no gradient, as "
+                f"{self.light_sampler.plugin} never chooses them; begin with a small positive value"
+            )
 
     def reset(self) -> None:
         """Forget what was learned. Compiled kernels are kept."""
@@ -115,7 +130,7 @@ class LightSamplingIntegrator(FilmIntegrator):
         return {"seconds_train": facts.get("seconds_visibility", 0.0), **self.film_state.statistics(), **facts}
 
 
-def _differentiates() -> bool:
+def differentiates() -> bool:
     """Whether gradients are being tracked."""
     x = mi.Float(0)
     dr.enable_grad(x)

@@ -128,8 +128,8 @@ class OutgoingIntegrator(CacheIntegrator):
 
     # -------------------------------------------------------------------------------------------------------------
 
-    def incident_radiance(self, scene, field, path, found, after, sampler):
-        return gradients.by_outgoing_cache(self, scene, field, self.content, after, sampler)
+    def incident_radiance(self, scene, lights, field, path, found, after, sampler):
+        return gradients.by_outgoing_cache(self, scene, lights, field, self.content, after, sampler)
 
     PROBES = 1
 

@@ -1,13 +1,14 @@
 """``plain_path``: the shortest correct path tracer."""
 
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.checks import check_gradients_in_media
+from mi_neural.integrators.checks import check_gradients_in_media, wants_gradients
 from mi_neural.integrators.keys import LIGHT_SAMPLER_KEY, register
-from mi_neural.integrators.lighting import LightSamplingIntegrator
+from mi_neural.integrators.lighting import LightSamplingIntegrator, differentiates
 from mi_neural.lights.unshadowed import UnshadowedLights
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
@@ -108,6 +109,9 @@ class PlainPathIntegrator(LightSamplingIntegrator):
     def check_gradients(self, scene) -> None:
         if self.media is not None:
             check_gradients_in_media(scene, self.plugin)
+        if self.neural_depth >= 0 and wants_gradients(scene):
+            raise RuntimeError("plain_path: predicted direct light has no gradients; leave neural_depth out")
+        super().check_gradients(scene)
 
     def direct(self, scene, lights, path, bsdf, found, numbers, sampler, alone=None):
         """As `paths.direct_light`; from `neural_depth` on as it is predicted, and what mirrors show."""
@@ -125,6 +129,8 @@ class PlainPathIntegrator(LightSamplingIntegrator):
             return self.estimate_media(scene, lights, sampler, mi.Ray3f(dr.detach(ray)), active)
         limit = self.depth_limit
         direct = self.direct if self.unshadowed is not None else None
+        if direct is None and lights is not None and self.film_state.entered and differentiates():
+            direct = partial(paths.direct_light, attached=True)  # the table of lights has no derivatives
 
         def step(path, sampler):
             found, sampler = paths.bounce(scene, lights, path, sampler, direct=direct)

@@ -2,11 +2,12 @@
 
 The gradient is that of the mean of I / (I_0 + ε), I_0 being the image as it is: each pixel counts the same. It is taken
 with respect to all colours, textures and other numbers of BSDFs and emitters that move nothing. Independent gradients
-are made in turn by each integrator, so that a change in the machine's load affects all of them; those with a cache are
-trained before, and not in between. Of each parameter (a texture is one) the variance of one gradient and the squared
-bias are taken relative to the squared norm of the reference, gradients by ``prb`` of many samples, whose own noise is
-subtracted. The efficiency is 1 / (variance x time), the first integrator's being 1: the geometric mean over the
-parameters of a kind. The error in a second is that of all parameters together, bias and noise, over their norm.
+are made in turn by each integrator, and timed in seconds of the processors (on a GPU: of the clock), so that a change
+in the machine's load affects all of them alike; those with a cache are trained before, and not in between. Of each
+parameter (a texture is one) the variance of one gradient and the squared bias are taken relative to the squared norm of
+the reference, gradients by ``prb`` of many samples, whose own noise is subtracted. The efficiency is 1 / (variance x
+time), the first integrator's being 1: the geometric mean over the parameters of a kind. The error in a second is that
+of all parameters together, bias and noise, over their norm.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.bench import environment, load, terminal
 from mi_neural.image import exr
+from mi_neural.render.kernels import work_seconds
 
 #: Added to a pixel, over the mean of the image.
 EPSILON = 0.1
@@ -81,11 +83,11 @@ def gradients(scene, params, keys, integrator, loss, spp: int, seed: int) -> tup
     for key in keys:
         dr.set_grad(params[key], 0)
     dr.eval([dr.grad(params[key]) for key in keys])
-    start = budget.clock()
+    start = work_seconds()
     integrator.render_backward(scene, params, loss, scene.sensors()[0], seed, spp)
     found = [dr.grad(params[key]) for key in keys]
     dr.eval(found)
-    seconds = budget.clock() - start
+    seconds = work_seconds() - start
     return [np.array(v, np.float64).ravel() for v in found], seconds
 
 
@@ -178,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=24, help="gradients by each integrator")
     parser.add_argument("--frames", type=int, default=300, help="training frames")
     parser.add_argument("--reference", type=int, default=256, help="samples a pixel of each gradient of the reference")
-    parser.add_argument("--max-depth", type=int, default=16)
+    parser.add_argument("--max-depth", type=int, default=-1, help="longest path; caches know no limit (default: -1)")
     parser.add_argument("-D", action="append", default=[], metavar="NAME=VALUE", help="parameters of the scene")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")

@@ -70,10 +70,21 @@ def adjoint_image(scene):
 
 def gradients_of(scene, params, keys, integrator, spp, seed, grad=None):
     """The gradients of `keys` in one array, by a call to ``render_backward``."""
-    for k in keys:
-        dr.set_grad(params[k], 0)
+    given = enable(params, keys)
     integrator.render_backward(scene, params, adjoint_image(scene) if grad is None else grad, 0, seed, spp)
-    return np.concatenate([np.array(dr.grad(params[k]), np.float64).ravel() for k in keys])
+    return np.concatenate([np.array(dr.grad(v), np.float64).ravel() for v in given])
+
+
+def enable(params, keys) -> list:
+    """The values of `keys`, given anew to the scene, which may keep what it computes from them (an environment map)."""
+    given = []
+    for k in keys:
+        value = type(params[k])(dr.detach(params[k]))
+        dr.enable_grad(value)
+        params[k] = value
+        given.append(value)
+    params.update()
+    return given
 
 
 def spread_of(scene, params, keys, integrator, spp, n=4):
@@ -118,6 +129,42 @@ def test_gradients_of_the_point_lit_sphere(name):
     assert integrator.cache.steps == steps, "the adjoint trains nothing"
     mi.render(scene, params, integrator=integrator, spp=1)
     assert integrator.cache.steps == steps + 1, "the next image does"
+
+
+@pytest.mark.parametrize("keys", [{}, {"light_sampler": {"type": "uniform_lights"}}])
+def test_gradients_of_a_surface_that_is_all_black(keys):
+    """Direct light and light from the cache, against a finite difference."""
+    scene = room(width=6)
+    key = "left.bsdf.reflectance.value"
+    params = mi.traverse(scene)
+    params[key] = mi.Color3f(0)
+    params.update()
+    found = gradients_of(scene, params, [key], train(scene, "nrc", **keys), 512, 1)
+    path, weight, images = mi.load_dict({"type": "path", "max_depth": 24}), np.array(adjoint_image(scene)), []
+    for value in (0.02, 0):
+        params[key] = mi.Color3f(value)
+        params.update()
+        images.append(np.sum(np.array(mi.render(scene, integrator=path, spp=4096, seed=3)) * weight, axis=(0, 1)))
+    expected = (images[0] - images[1]) / 0.02
+    print(found, expected)
+    np.testing.assert_allclose(found, expected, rtol=0.1)
+
+
+@pytest.mark.parametrize("records", [True, False])
+def test_environment_has_gradients_whatever_the_passes(monkeypatch, records):
+    """The camera sees it directly, and by reflection; in three passes, and with functions that cannot be recorded."""
+    sky = mi.Bitmap(np.random.default_rng(2).uniform(0, 1, (4, 8, 3)).astype(np.float32))
+    scene = room(width=8, sky={"type": "envmap", "bitmap": sky},
+                 eye={"type": "perspective", "fov": 70, "to_world": T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]),
+                      "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"},
+                               "pixel_format": "rgb"}})  # fmt: skip
+    params, keys = mi.traverse(scene), ["sky.data"]
+    integrator = train(scene, "nrc")
+    integrator.records = records
+    theirs = spread_of(scene, params, keys, mi.load_dict({"type": "prb", "max_depth": 24}), 1024)
+    for name, size in (("one pass", 2**22), ("three passes", 64 * 64)):
+        monkeypatch.setattr(importlib.import_module("mi_neural.integrators.gradients"), "PASS_SAMPLES", size)
+        agree(name, spread_of(scene, params, keys, integrator, 192), theirs)
 
 
 def test_gradients_of_what_is_black():
@@ -234,16 +281,20 @@ def warnings():
     logger.add_appender(known)
 
 
-@pytest.mark.parametrize("name", ["nirc", "nrc"])
-def test_forward_and_backward_are_transposes(name):
+@pytest.mark.parametrize("name, key, lights", [
+    ("nirc", "floor.bsdf.reflectance.data", {}), ("nrc", "floor.bsdf.reflectance.data", {}), ("nrc", "sky.data", {}),
+    ("nrc", "sky.data", {"light_sampler": {"type": "power_lights"}}),
+])  # fmt: skip
+def test_forward_and_backward_are_transposes(name, key, lights):
     """<δ, J v> = <Jᵀ δ, v> with the same samples; a Gaussian filter, a crop window, channels."""
     film = {"type": "hdrfilm", "width": 16, "height": 12, "crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 8,
             "crop_height": 7, "rfilter": {"type": "gaussian"}, "pixel_format": "rgba",
             "sample_border": True}  # fmt: skip
-    eye = {"type": "perspective", "fov": 45, "to_world": T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]), "film": film}
-    scene = room(eye=eye)
-    params, key = mi.traverse(scene), "floor.bsdf.reflectance.data"
-    integrator = train(scene, name, channels="depth", train_frames=8)
+    eye = {"type": "perspective", "fov": 70, "to_world": T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]), "film": film}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.random.default_rng(2).uniform(0, 1, (4, 8, 3)).astype(np.float32))}
+    scene = room(eye=eye, sky=sky)
+    params = mi.traverse(scene)
+    integrator = train(scene, name, channels="depth", train_frames=8, **lights)
     known, t = mi.TensorXf(params[key]), mi.Float(0)
     v = np.random.default_rng(3).normal(size=known.shape).astype(np.float32)
     dr.enable_grad(t)
@@ -325,15 +376,16 @@ def test_shapes_have_the_gradient_of_prb_and_are_named_once(warnings):
     assert len(said) == 1 and "block.vertex_positions" in said[0]
 
 
-@pytest.mark.parametrize("gradient", ["cache", "prb"])
-def test_light_sampler_that_has_no_part_in_gradients_is_named_once(warnings, gradient):
+def test_prb_that_leaves_the_light_sampler_out_is_named_once(warnings):
     scene = room(width=6)
     params, keys = tracked(scene)
-    keys_of = {"train_frames": 8, "gradient": gradient}
-    nested = train(scene, "nrc", **keys_of, light_sampler={"type": "power_lights"})
-    for seed in range(2):
-        gradients_of(scene, params, keys, nested, 1, seed)
-    assert len([w for w in warnings if "as Mitsuba does, without power_lights" in w]) == 1
+    keys_of = {"train_frames": 8, "light_sampler": {"type": "power_lights"}}
+    for gradient in ("cache", "prb"):
+        nested = train(scene, "nrc", gradient=gradient, **keys_of)
+        for seed in range(2):
+            gradients_of(scene, params, keys, nested, 1, seed)
+        named = [w for w in warnings if "by prb choose lights as Mitsuba does, without power_lights" in w]
+        assert len(named) == (gradient == "prb")
 
 
 def test_channels_without_gradient_are_named_once(warnings):

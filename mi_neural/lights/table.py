@@ -130,6 +130,12 @@ class LightTable:
         self.kinds = sorted(set(columns["kind"].tolist()))
         self.facts = (self.n_lights, n_texels, *sorted(self.forms), self.others, self.all_plain, *self.kinds)
 
+    def n_dark(self) -> int:
+        """Number of lamps without extent that emit nothing, so that no BSDF sample finds them, and a light sampler that
+        weighs by intensity none either."""
+        c = self.columns
+        return int(((c["intensity"] == 0) & ((c["form"] == POINT) | (c["form"] == OTHER)) & (c["radius"] == 0)).sum())
+
     def _has(self, *forms: int) -> bool:
         return not self.forms.isdisjoint(forms)
 
@@ -157,27 +163,31 @@ class LightTable:
         front = active & (mi.Frame3f.cos_theta(si.wi) > 0)
         return dr.gather(mi.Color3f, self.radiance, index, front)
 
-    def sample(self, scene, si, index, sample, active):
+    def sample(self, scene, si, index, sample, active, attached: bool = False):
         """A point on (direction to) light `index`, seen from `si`.
 
         Returns (direction sample, radiance over its density, density over solid angle). The density is 0 where the
-        light does not reach `si`; of delta lights it is 1, and `ds.delta` is set. No shadow ray is traced.
+        light does not reach `si`; of delta lights it is 1, and `ds.delta` is set. No shadow ray is traced. With
+        `attached` the radiance is what the emitters say, not the table: it has derivatives with respect to them.
         """
         form = self._form(index, active)
         ds, weight, pdf = dr.zeros(mi.DirectionSample3f, dr.width(index)), mi.Spectrum(0), mi.Float(0)
         cases = []
         if self._has(*PLANE, *CYLINDERS):
             mine = active & _by_area(form)
-            cases.append((mine, *self._sample_area(scene, si, index, form, sample, mine)))
+            cases.append((mine, *self._sample_area(scene, si, index, form, sample, mine, attached)))
         if self._has(SPHERE):
             mine = active & (form == SPHERE)
-            cases.append((mine, *self._sample_sphere(si, index, sample, mine)))
+            cases.append((mine, *self._sample_sphere(scene, si, index, sample, mine, attached)))
         if self._has(POINT):
             mine = active & (form == POINT)
-            cases.append((mine, *self._sample_point(si, index, mine)))
+            cases.append((mine, *self._sample_point(scene, si, index, mine, attached)))
         if self._has(OTHER):
             mine = active & (form == OTHER) & ~self._is_texel(index)
             ds_other, w_other = self._by_emitters(scene, index, mine, lambda e, m: e.sample_direction(si, sample, m))
+            if attached:
+                w_other = self._by_emitters(scene, index, mine, lambda e, m: e.eval_direction(si, ds_other, m))
+                w_other = dr.select(ds_other.pdf > 0, w_other / dr.detach(ds_other.pdf), 0)
             cases.append((mine, ds_other, w_other, ds_other.pdf))
         if self.sky is not None:
             mine = active & self._is_texel(index)
@@ -232,7 +242,10 @@ class LightTable:
         right_handed = dr.dot(dr.cross(edge1, edge2), along) > 0
         return dr.select(right_handed == (form == CYLINDER), mi.Float(1), -1)
 
-    def _sample_area(self, scene, si, index, form, sample, active):
+    def _emitter(self, scene, index, active):
+        return dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, active), active)
+
+    def _sample_area(self, scene, si, index, form, sample, active, attached):
         p, normal, area, uv = self._on_area(index, form, sample, active)
         to_light = p - si.p
         d2 = dr.squared_norm(to_light)
@@ -243,15 +256,15 @@ class LightTable:
         ds.p, ds.n, ds.uv, ds.d, ds.dist = p, mi.Normal3f(normal), mi.Point2f(uv), d, dr.sqrt(d2)
         ds.pdf, ds.delta = pdf, mi.Bool(False)
         radiance = dr.gather(mi.Color3f, self.radiance, index, active) if is_rgb() else mi.Spectrum(0)
-        if not self.all_plain:
-            varied = active & ~dr.gather(mi.Bool, self.plain, index, active)
-            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, self.emitter, index, varied),
-                                varied)  # fmt: skip
-            at = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+        if attached or not self.all_plain:
+            varied = active if attached else active & ~dr.gather(mi.Bool, self.plain, index, active)
+            emitter = self._emitter(scene, index, varied)
+            at = _surface(p, normal, uv, d, ds.dist)
             if self._has(TRIANGLE, PARALLELOGRAM):
                 flat = varied & ((form == TRIANGLE) | (form == PARALLELOGRAM))
-                at = interaction(emitter.get_shape(), dr.gather(mi.UInt32, self.prim, index, flat), uv,
-                                 mi.Ray3f(si.p, d), flat)  # fmt: skip
+                on_mesh = interaction(emitter.get_shape(), dr.gather(mi.UInt32, self.prim, index, flat), uv,
+                                      mi.Ray3f(si.p, d), flat)  # fmt: skip
+                at = dr.select(flat, on_mesh, at)
             if self._has(*CYLINDERS):
                 round_ = varied & ((form == CYLINDER) | (form == CYLINDER_INSIDE))
                 at = dr.select(round_, _surface(p, normal, uv, d, ds.dist), at)
@@ -260,7 +273,7 @@ class LightTable:
             radiance = dr.select(varied, emitter.eval(at, varied), radiance)
         return ds, dr.select(pdf > 0, radiance / pdf, 0), pdf
 
-    def _sample_sphere(self, si, index, sample, active):
+    def _sample_sphere(self, scene, si, index, sample, active, attached=False):
         """Uniformly within the cone that a sphere fills, seen from outside (Shirley et al. 1996)."""
         center = dr.gather(mi.Vector3f, self.center, index, active)
         radius = dr.gather(mi.Float, self.radius, index, active)
@@ -285,17 +298,24 @@ class LightTable:
         ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
         ds.p, ds.n, ds.d, ds.dist = p, mi.Normal3f(n), to_light * dr.rsqrt(dr.maximum(d2, 1e-30)), dr.sqrt(d2)
         ds.pdf, ds.delta = pdf, mi.Bool(False)
-        radiance = dr.gather(mi.Color3f, self.radiance, index, active)
+        if attached:
+            radiance = self._emitter(scene, index, active).eval(_surface(p, n, ds.uv, ds.d, ds.dist), active)
+        else:
+            radiance = dr.gather(mi.Color3f, self.radiance, index, active)
         return ds, dr.select(outside, radiance / pdf, 0), pdf
 
-    def _sample_point(self, si, index, active):
+    def _sample_point(self, scene, si, index, active, attached):
         p = mi.Point3f(dr.gather(mi.Vector3f, self.center, index, active))
         to_light = p - si.p
         d2 = dr.squared_norm(to_light)
         ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
         ds.p, ds.d, ds.dist = p, to_light * dr.rsqrt(dr.maximum(d2, 1e-30)), dr.sqrt(d2)
         ds.pdf, ds.delta = dr.select(active & (d2 > 0), mi.Float(1), 0), mi.Bool(True)
-        return ds, dr.gather(mi.Color3f, self.radiance, index, active) / dr.maximum(d2, 1e-30), ds.pdf
+        if attached:
+            irradiance = self._emitter(scene, index, active).eval_direction(si, ds, active)
+        else:
+            irradiance = dr.gather(mi.Color3f, self.radiance, index, active) / dr.maximum(d2, 1e-30)
+        return ds, irradiance, ds.pdf
 
     def pdf(self, scene, si_ref, index, si_light, ds, active):
         """Density over solid angle with which `sample` would have found the point `si_light` on light `index`."""
@@ -338,7 +358,7 @@ class LightTable:
             target = dr.select(mine, self._on_area(index, form, sample, mine)[0], target)
         if self._has(SPHERE):
             mine = active & (form == SPHERE)
-            ds, _, pdf = self._sample_sphere(it, index, sample, mine)
+            ds, _, pdf = self._sample_sphere(scene, it, index, sample, mine)
             target = dr.select(mine & (pdf > 0), ds.p, target)
         if self._has(OTHER):
             mine = active & (form == OTHER) & ~self._is_texel(index)

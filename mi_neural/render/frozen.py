@@ -52,6 +52,20 @@ def _hit_in(scene, sample):
     return si.t, bs.pdf, weight, si.emitter(scene).eval(si)
 
 
+def can_freeze_lights(scene) -> bool:
+    """Whether Dr.Jit can freeze a function that samples the lights of this scene as Mitsuba does (3.9.1: not where an
+    area light shows a picture). Tried where there are such lights.
+    """
+    varies = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.SpatiallyVarying)
+    return all(int(e.flags()) & varies != varies for e in scene.emitters()) or _records(_lit_in, scene)
+
+
+def _lit_in(scene, sample):
+    it = dr.zeros(mi.Interaction3f, 2)
+    ds, weight = scene.sample_emitter_direction(it, sample, True)
+    return ds.pdf, ds.p, weight
+
+
 def _records(function, thing) -> bool:
     try:
         with dr.suspend_grad(), undisturbed():

@@ -163,7 +163,7 @@ def sample_bsdf(si, bsdf, lobe, direction, active) -> tuple:
 
 def bounce(
     scene, lights, path: PathState, sampler, numbers: Numbers | None = None, *, bsdf=None, sampled: tuple | None = None,
-    follow: Callable | None = None, alone: Callable | None = None, direct: Callable | None = None,
+    follow: Callable | None = None, alone: Callable | None = None, direct: Callable | None = None, black: bool = False,
 ):  # fmt: skip
     """Sample the BSDF where `path` stands, trace that ray, and find direct light. Returns (:class:`Bounce`, sampler).
 
@@ -175,13 +175,14 @@ def bounce(
     alone    ``alone(pdf)`` says at which densities of the BSDF no ray will be traced, so that next-event estimation
              counts in full
     direct   in place of :func:`direct_light`, with the same arguments
+    black    whether rays are traced from BSDFs whose value is 0, too: it may have a derivative
     """
     si, active = path.si, path.active
     if numbers is None:
         numbers, sampler = draw_numbers(sampler)
     bsdf = si.bsdf(path.ray) if bsdf is None else bsdf
     bs, weight, delta = sampled or sample_bsdf(si, bsdf, numbers.lobe, numbers.direction, active)
-    followed = active & (dr.max(weight) > 0)
+    followed = active & ((bs.pdf > 0) if black else (dr.max(weight) > 0))
     if follow is not None:
         followed &= follow(bs, delta)
     ray = si.spawn_ray(si.to_world(bs.wo))
@@ -201,11 +202,13 @@ class Surface:
     in_full  whether emission that the path met counts in full, as no light sample finds it
     around   whether it receives light from all directions alike; None: nowhere
     untested whether shadow rays are left to `light_arriving`, the scene's own light samples included
+    attached whether derivatives are wanted
     """
 
     around, untested = None, False
 
-    def __init__(self, path: PathState, bsdf, found: Bounce):
+    def __init__(self, path: PathState, bsdf, found: Bounce, attached: bool = False):
+        self.attached = attached
         self.it = self.origin = path.si
         self.bsdf, self.found = bsdf, found
         self.in_full = found.delta
@@ -238,7 +241,8 @@ class Surface:
         """(`light` as it comes through the scene, where it is `sampled` and not shadowed, sampler). `tested`: whether a
         shadow ray has been traced."""
         if not tested:
-            sampled &= dr.max(f * light) > 0
+            if not self.attached:  # what is 0 may have a derivative
+                sampled &= dr.max(f * light) > 0
             sampled &= ~scene.ray_test(self.it.spawn_ray_to(ds.p), sampled)
         return light, sampled, sampler
 
@@ -251,15 +255,17 @@ def direct_light(
 
     They are weighted against each other, so that ``E[first + f/p second] = ∫ f Le cos dω``. `here`: what stands there,
     in place of a :class:`Surface`. `attached`: both have derivatives with respect to BSDFs and emitters, inside of
-    ``dr.suspend_grad()`` too, where directions and weights have none; `lights` must be None, and `here` a surface.
+    ``dr.suspend_grad()`` too, where directions and weights have none; `here` must be a surface. The choice of a light
+    has none ever.
     """
-    here = here or Surface(path, bsdf, found)
+    here = here or Surface(path, bsdf, found, attached)
     hit = _light_hit(scene, lights, here, found)
     L_nee, choice, sampler = _light_sample(
         scene, lights, here, path.active, hit, numbers.light, numbers.point, sampler, 1, alone, attached
     )  # fmt: skip
     weighed = hit.emits & ~here.in_full
-    pmf_hit = None if lights is None else here.pmf_hit(lights, choice, hit.index, weighed)
+    with dr.suspend_grad(when=attached):
+        pmf_hit = None if lights is None else here.pmf_hit(lights, choice, hit.index, weighed)
     return L_nee, _light_met(scene, lights, here, found, hit, pmf_hit, 1, attached), sampler
 
 
@@ -316,15 +322,19 @@ def _light_sample(scene, lights, here, active, hit: _Hit, u, point, sampler, n_l
     else:
         n, transmits = here.received
         in_media = {} if here.around is None else {"around": here.around}
-        choice = lights.choose(here.it, n, transmits, u, sampler, hit.index, active, **in_media)
+        with dr.suspend_grad(when=attached):
+            choice = lights.choose(here.it, n, transmits, u, sampler, hit.index, active, **in_media)
         sampler = choice.advanced(sampler)
-        ds, light, pdf = lights.table.sample(scene, here.it, choice.index, point, smooth & (choice.weight > 0))
-        light *= choice.weight
+        with dr.resume_grad(when=attached):
+            ds, light, pdf = lights.table.sample(
+                scene, here.it, choice.index, point, smooth & (choice.weight > 0), attached
+            )  # fmt: skip
+            light *= choice.weight
         pdf_light, sampled = choice.pmf * pdf, smooth & (pdf > 0)
 
     with dr.resume_grad(when=attached):
         f, pdf_bsdf = here.eval_pdf(ds.d, sampled)
-        if attached:
+        if attached and lights is None:
             emitted = scene.eval_emitter_direction(here.it, ds, sampled)
             light = dr.replace_grad(light, emitted * dr.select(sampled, dr.rcp(ds.pdf), 0))
     pdf_bsdf = dr.detach(pdf_bsdf)
