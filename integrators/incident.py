@@ -29,8 +29,8 @@ INCIDENT_KEYS = """
      * - local_limit
        - |float|
        - Of ``loss="local"``: the mean prediction of a place counts as at most so many times the mean target of the
-         scene. Places brighter than that then weigh alike, and their errors upwards as much as those downwards.
-         (Default: 8)"""
+         scene, but at least as half of itself. Places between then weigh alike, and their errors upwards as much as
+         those downwards. (Default: 8)"""
 
 #: The list of the constants of both presets, for the docstrings
 INCIDENT_PRESETS = """

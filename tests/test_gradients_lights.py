@@ -41,10 +41,11 @@ _TRUE = {}
 
 
 def by_prb(scene, params, keys):
-    """Gradients by ``prb`` and their errors, computed once for all tests."""
-    if not _TRUE:
-        _TRUE["all"] = spread_of(scene, params, keys, mi.load_dict({"type": "prb", "max_depth": 24}), 4096)
-    return _TRUE["all"]
+    """Gradients by ``prb`` and their errors, computed once for each list of keys: a BSDF that several shapes share has
+    the name of one or another of them, from load to load."""
+    if tuple(keys) not in _TRUE:
+        _TRUE[tuple(keys)] = spread_of(scene, params, keys, mi.load_dict({"type": "prb", "max_depth": 24}), 2048)
+    return _TRUE[tuple(keys)]
 
 
 def by_autodiff(scene, params, keys, integrator, grad, spp, seed):

@@ -249,15 +249,15 @@ def test_rate_falls_to_a_tenth_and_decay_grows_from_zero():
     assert {Training(ema_decay=0.0).decay(k) for k in (0, 10, 1000)} == {0}
 
 
-@pytest.mark.parametrize("limit, ratio", [(8.0, 1.0), (math.inf, (25**2 + 10) / (15**2 + 10))])
+@pytest.mark.parametrize("limit, ratio", [(8.0, 1.0), (math.inf, (15**2 + 10) / (9**2 + 10))])
 def test_errors_of_bright_places_weigh_alike_upwards_and_downwards(monkeypatch, limit, ratio):
-    """Targets 20 times the scene's mean, predictions of 15 and 25 that are their places' local means: with a norm of
-    these alone the error downwards pulls 2.7 times as hard."""
-    monkeypatch.setattr(incident, "local_mean", lambda *_: mi.Float(15, 25))
-    records, p = dr.zeros(TrainingRecords, 2), mi.Color3f(mi.Float(15, 25))
+    """Targets 12 times the scene's mean, predictions of 9 and 15 that are their places' local means: with a norm of
+    these alone the error downwards pulls 2.6 times as hard."""
+    monkeypatch.setattr(incident, "local_mean", lambda *_: mi.Float(9, 15))
+    records, p = dr.zeros(TrainingRecords, 2), mi.Color3f(mi.Float(9, 15))
     dr.enable_grad(p)
     training = Training(epsilon=10.0, local_limit=limit)
-    dr.backward(incident._errors(constant_field(1.0), records, training, mi.UInt32(1), p, mi.Color3f(20), {}))
+    dr.backward(incident._errors(constant_field(1.0), records, training, mi.UInt32(1), p, mi.Color3f(12), {}))
     up, down = np.array(dr.grad(p))[0]
     assert up < 0 < down and -up / down == pytest.approx(ratio, rel=1e-4)
 

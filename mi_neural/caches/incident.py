@@ -38,6 +38,9 @@ WORLD_SHARE = 0.25
 #: What training lessens; the second is the authors'.
 LOSSES = ("local", "weighted")
 
+#: Local means count as at least so much of themselves, whatever `local_limit`.
+LEAST_LOCAL = 0.5
+
 
 @dataclass(frozen=True)
 class Training:
@@ -52,9 +55,10 @@ class Training:
     epsilon          of the loss, over the squared mean target of the scene. Where the local mean, itself a prediction,
                      is the whole norm, targets count less when it overshoots, and the cache drifts upwards: with 0.03
                      in a whole room lit through a slit (manual, measured)
-    local_limit      local means count as at most so many times the scene's mean target, for the same reason: where a
-                     place is far brighter than most, `epsilon` is nothing beside its own mean. Lower ones make the
-                     cache leak light into dark rooms: `ajar_door` with 4 (manual, measured)
+    local_limit      local means count as at most so many times the scene's mean target, but at least as half of
+                     themselves, for the same reason: where a place is far brighter than most, `epsilon` is nothing
+                     beside its own mean. Lower ones make the cache leak light into dark rooms (`ajar_door` with 4), and
+                     without the half a lamp shows through its housing (manual, measured)
     learning_rate    of Adam, at the start; see `rate`
     ema_decay        longest horizon of the averaged copy: 1 / (1 - ema_decay) steps
     last_rate        share of the learning rate that it falls to
@@ -221,7 +225,8 @@ def _errors(field: Field, records: TrainingRecords, training: Training, seed, p,
         mean_local = local_mean(field, features, records, training.n_local, sampler)
     dr.schedule(mean_local)  # or the gradient by way of the shortcut would ask for the mean again
     epsilon = training.epsilon * dr.maximum(dr.square(field.mean), 1e-12)
-    return loss.local_relative_l2(p, y, dr.minimum(mean_local, training.local_limit * field.mean), epsilon)
+    limited = dr.minimum(mean_local, training.local_limit * field.mean)
+    return loss.local_relative_l2(p, y, dr.maximum(limited, LEAST_LOCAL * mean_local), epsilon)
 
 
 class IncidentCache(Trainer):
