@@ -54,14 +54,7 @@ class _State:
         self.measured: dict = {}  # of the scene
         self.plan: plan.ScenePlan | None = None  # of the scene that was rendered last
         self.bound = BoundScene()
-        self.said: set[str] = set()
         self.reset()
-
-    def say_once(self, text: str) -> None:
-        """Warn of something that holds from now on."""
-        if text not in self.said:
-            self.said.add(text)
-            mi.Log(mi.LogLevel.Warn, f"mi_neural: {text}")
 
     def reset(self) -> None:
         self.signature = None

@@ -97,19 +97,29 @@ def render_backward(integrator, scene, params, grad_in, sensor=0, seed=0, spp=0)
         prb_of(integrator).render_backward(scene, params, grad_in, sensor, seed, spp)
 
 
+def name_black_lamps(integrator) -> None:
+    """Say once which lamps have no gradient, as the light sampler that is bound never chooses them."""
+    lights = integrator.bound_lights
+    if lights is not None and (dark := lights.table.n_dark()):
+        integrator.film_state.say_once(
+            f"{integrator.plugin}: {dark} lamps without extent are black and get no gradient, as "
+            f"{integrator.light_sampler.plugin} never chooses them; begin with a small positive value"
+        )
+
+
 def _by_cache(integrator, scene, params, sensor) -> bool:
     """Whether derivatives come from the cache. What stands against it, or is left out, is named once."""
-    plugin, state = integrator.plugin, integrator.state
+    plugin, state, say_once = integrator.plugin, integrator.state, integrator.film_state.say_once
     if media_of(scene, [sensor]):
         raise no_gradients_in_media(plugin)
     if integrator.channels:
-        state.say_once(f"{plugin}: the channels {', '.join(integrator.channels)} have no gradient")
+        say_once(f"{plugin}: the channels {', '.join(integrator.channels)} have no gradient")
     moving = []
     if integrator.gradient != "prb":
         with dr.resume_grad():
             moving = moved(scene, params)
         if moving:
-            state.say_once(
+            say_once(
                 f"{plugin}: gradients come from prb, because the cache has none of shapes and sensors: "
                 f"{', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
             )
@@ -120,15 +130,12 @@ def _by_cache(integrator, scene, params, sensor) -> bool:
     by_cache = integrator.gradient != "prb" and not moving and integrator.needs_cache
     if not by_cache and (integrator.nested_sampler is not None or state.lights is not None):
         name = getattr(integrator.light_sampler, "plugin", "a light sampler")
-        state.say_once(
+        say_once(
             f"{plugin}: gradients by prb choose lights as Mitsuba does, without {name}; where that is wrong (mi-neural "
             "doc limits) they are wrong, too"
         )
-    if by_cache and state.lights is not None and (dark := state.lights.table.n_dark()):
-        state.say_once(
-            f"{plugin}: {dark} lamps without extent are black and get no gradient, as "
-            f"{integrator.light_sampler.plugin} never chooses them; begin with a small positive value"
-        )
+    if by_cache:
+        name_black_lamps(integrator)
     return by_cache
 
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mi_neural.integrators.base import FilmIntegrator
 from mi_neural.integrators.checks import check_scene, sensor_of
-from mi_neural.integrators.gradients import moved
+from mi_neural.integrators.gradients import moved, name_black_lamps
 from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
@@ -86,11 +86,8 @@ class LightSamplingIntegrator(FilmIntegrator):
                 f"{self.plugin}: lights are chosen as Mitsuba does, without {self.light_sampler.plugin}, where "
                 f"gradients of their shapes are wanted: {', '.join(moving[:4])}{', ...' if len(moving) > 4 else ''}"
             )
-        elif dark := self.lights.table.n_dark():
-            self.film_state.say_once(
-                f"{self.plugin}: {dark} lamps without extent are black and get no gradient, as "
-                f"{self.light_sampler.plugin} never chooses them; begin with a small positive value"
-            )
+        else:
+            name_black_lamps(self)
 
     def reset(self) -> None:
         """Forget what was learned. Compiled kernels are kept."""

@@ -79,10 +79,11 @@ class NeuralPathIntegrator(OutgoingIntegrator):
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
         """Train for about `seconds` of wall time, longer by a factor of `LONGER` if `LEAST_STEPS` take that long. A
         cache that can not have them stays out of images until it has. Returns :meth:`statistics`."""
-        start, self.state.hurried = time.perf_counter(), True
+        start = time.perf_counter()
         self.bind(scene, self._sensor(scene, sensor), train=False)
         missing = 0 if self.freeze_cache or not self.needs_cache else max(0, LEAST_STEPS - self.cache.steps)
         if missing:
+            self.state.hurried = True
             needed = missing * self.seconds_of_step(scene, sensor)
             if needed > LONGER * seconds:
                 return self.statistics()

@@ -148,12 +148,13 @@ class PlainPathIntegrator(LightSamplingIntegrator):
         def step(path, sampler):
             numbers, sampler = paths.draw_numbers(sampler)
             if not media.partial:  # elsewhere a path may stay at its first vertex for some steps
-                numbers = paths.choose_numbers(path.depth == 1, paths.stratified(sampler), numbers)
+                numbers = dr.select(path.depth == 1, numbers_first, numbers)
             found, sampler = media.bounce(self, scene, lights, path, sampler, numbers)
             path = media.advance(self, path, found)
             return paths.roulette(path, sampler, self.rr_depth + 1)  # volpath's begins one bounce later
 
         path, sampler = media.camera_vertex(self, scene, ray, self.camera_medium, sampler, active)
+        numbers_first = paths.stratified(sampler)
         path, sampler = dr.while_loop((path, sampler), lambda path, sampler: path.active, step, label="path")
         return path.L, path.valid, {}
 

@@ -265,9 +265,6 @@ class LightTable:
                 on_mesh = interaction(emitter.get_shape(), dr.gather(mi.UInt32, self.prim, index, flat), uv,
                                       mi.Ray3f(si.p, d), flat)  # fmt: skip
                 at = dr.select(flat, on_mesh, at)
-            if self._has(*CYLINDERS):
-                round_ = varied & ((form == CYLINDER) | (form == CYLINDER_INSIDE))
-                at = dr.select(round_, _surface(p, normal, uv, d, ds.dist), at)
             if mi.is_spectral:
                 at.wavelengths = si.wavelengths
             radiance = dr.select(varied, emitter.eval(at, varied), radiance)

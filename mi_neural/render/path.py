@@ -16,7 +16,7 @@ for `valid` (alpha), null surfaces, ``hide_emitters``, ``rr_depth`` and ``max_de
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -148,11 +148,6 @@ def stratified(sampler, n=1, i=0) -> Numbers:
         sampler.stratified_1d(LOBE, n, i), sampler.stratified_2d(DIRECTION, n, i), sampler.stratified_1d(LIGHT, n, i),
         sampler.stratified_2d(POINT, n, i),
     )  # fmt: skip
-
-
-def choose_numbers(mask, a: Numbers, b: Numbers) -> Numbers:
-    """The numbers `a` where the mask says so, else `b`."""
-    return Numbers(*(dr.select(mask, getattr(a, f.name), getattr(b, f.name)) for f in fields(Numbers)))
 
 
 def sample_bsdf(si, bsdf, lobe, direction, active) -> tuple:
