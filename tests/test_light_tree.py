@@ -204,8 +204,8 @@ def test_the_nearest_light_is_chosen_often():
     lights_ = TreeLights(table)
     facing_down = np.flatnonzero(table.columns["axis"][:, 2] < 0)
     below = (table.columns["center"] - [0, 0, 0.08]).tolist()
-    pmf = np.array([pmf_of_all(lights_, below[k], [0, 0, 1])[k] for k in facing_down[::5]])
-    print(pmf.round(3))
+    pmf = np.array([pmf_of_all(lights_, below[k], [0, 0, 1])[k] for k in facing_down])
+    print(pmf.mean(), pmf.min(), len(pmf))
     assert pmf.mean() > 0.18 and pmf.min() > 0.05
 
 
