@@ -3,6 +3,7 @@
 The variant is llvm_ad_rgb; `MI_NEURAL_TEST_VARIANT=cuda_ad_rgb python -m pytest` runs the same tests on a GPU.
 """
 
+import functools
 import gc
 import importlib
 import os
@@ -30,6 +31,10 @@ ROOT = Path(__file__).resolve().parents[1]
 if text := mi_neural.variant_problem(VARIANT):
     raise pytest.UsageError(f"MI_NEURAL_TEST_VARIANT: {text}")
 mi.set_variant(VARIANT)  # test modules may use mi.* while they are collected
+#: Tests load scenes on one thread: with more, a scene's lights and shapes are numbered in another order each time, and
+#: the same seeds choose other lights.
+mi.load_dict = functools.partial(mi.load_dict, parallel=False)
+mi.load_file = functools.partial(mi.load_file, parallel=False)
 #: Begins the code of a fresh interpreter: kernels and threads are as in this process.
 QUICK = f"""import sys
 sys.path.insert(0, {str(ROOT / 'tests')!r})
