@@ -55,7 +55,8 @@ class LightSamplingIntegrator(FilmIntegrator):
             self.bound.changed(scene)
         self.film_state.n_bound += 1
         if self.light_sampler is not None:
-            self.lights = self.light_sampler.lights(scene, recordable(sensor, self.film_state.n_bound), train)
+            view = recordable(sensor, self.film_state.n_bound, self.film_state.scene_records(scene))
+            self.lights = self.light_sampler.lights(scene, view, train)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if self.film_state.entered:  # Mitsuba's own render() comes back here once

@@ -76,3 +76,33 @@ def test_what_holds_rgb_says_what_works(variant):
     sampler = {"type": "nvc_lights"}
     with pytest.raises(RuntimeError, match="neural_depth works in RGB variants alone"):
         mi.load_dict({"type": "plain_path", "neural_depth": 0, "light_sampler": sampler})
+
+
+def test_films_with_spectral_bands_are_those_of_path(run_python):
+    """In a process of its own: in Mitsuba 3.9.1 nothing can be frozen while a ``specfilm`` exists."""
+    run_python("""
+import mitsuba as mi, numpy as np
+mi.set_variant("llvm_ad_spectral")
+T = mi.ScalarTransform4f
+view = {"type": "perspective", "fov": 50, "to_world": T().look_at([0, 0, 3.5], [0, 0, 0], [0, 1, 0])}
+bands = {f"band_{b}": {"type": "spectrum", "value": [(b - 60, 0.0), (b, 1.0), (b + 60, 0.0)]} for b in (450, 550, 650)}
+film = {"width": 8, "height": 8, "rfilter": {"type": "box"}}
+red = {"type": "rgb", "value": [0.7, 0.4, 0.2]}
+scene = mi.load_dict({
+    "type": "scene", "wide": {**view, "film": {"type": "hdrfilm", **film}},
+    "bands": {**view, "film": {"type": "specfilm", **film, **bands}},
+    "floor": {"type": "rectangle", "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(2),
+              "bsdf": {"type": "diffuse", "reflectance": red}},
+    "ball": {"type": "sphere", "radius": 0.3, "emitter": {"type": "area", "radiance": 2.0}},
+    "point": {"type": "point", "position": [0, 0.9, 1], "intensity": 1.0},
+})
+def mean(integrator, sensor, seed):
+    return np.array(mi.render(scene, integrator=integrator, sensor=sensor, spp=4096, seed=seed)).mean(axis=(0, 1))
+path = mi.load_dict({"type": "path", "max_depth": 3})
+known = [mean(path, k, 7) for k in range(2)]
+for keys in ({}, {"light_sampler": {"type": "tree_lights"}},
+             {"light_sampler": {"type": "nvc_lights", "train_frames": 2, "train_samples": 64}}):
+    ours = mi.load_dict({"type": "plain_path", "max_depth": 3, **keys})
+    for k in (0, 1, 0, 1):
+        np.testing.assert_allclose(mean(ours, k, 3), known[k], rtol=0.05)
+""", quick=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .frozen import can_freeze, disturbed, undisturbed
+from .frozen import can_freeze, disturbed, is_special, undisturbed
 from .sampling import PathSampler
 from .spectrum import film_colour
 
@@ -136,9 +136,10 @@ class RaySensor:
         return False
 
 
-def recordable(sensor, seed: int):
-    """`sensor`, or rays of it where it cannot be part of a recorded function. Another `seed` gives other rays."""
-    return sensor if can_freeze(sensor) else RaySensor.of(sensor, seed)
+def recordable(sensor, seed: int, scene_records: bool = True):
+    """`sensor`, or rays of it where it, or its scene, cannot be part of a recorded function. Another `seed` gives other
+    rays."""
+    return sensor if scene_records and can_freeze(sensor) else RaySensor.of(sensor, seed)
 
 
 @dataclass
@@ -213,6 +214,8 @@ class Passes:
         if sums:  # as with a box filter
             area = replace(area, box=True)
         alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        special = film if is_special(sensor) else None
+        record = record and special is None
         n_pixels = area.width * sizes[0]
         n_lanes = -(-n_pixels // PACKET) * PACKET * sizes[1]
         offset = dr.opaque(mi.Point2f, [float(v) for v in area.offset])
@@ -224,11 +227,13 @@ class Passes:
             dr.eval(rays)
         key = (kind_of(sensor) if direct else "", area.width, area.size, area.border, area.box, alpha, sizes,
                tuple(channels), keys, record)  # fmt: skip
-        if key not in self.recorded:
-            plain = _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes)
+        plain = _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes, special)
+        if special is None and key not in self.recorded:
             self.recorded[key] = dr.freeze(plain, auto_opaque=False) if record else plain
         arguments = scene, sensor if rays is None else None, rays, lights, field, samples, offset, settings
         with undisturbed():
+            if special is not None:
+                return plain(*arguments)
             try:
                 return self.recorded[key](*arguments)
             except RuntimeError as e:
@@ -236,7 +241,7 @@ class Passes:
                     raise
                 mi.Log(mi.LogLevel.Debug, f"mi_neural: a pass could not be recorded: {e}")
                 del self.recorded[key]
-                return _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes)(*arguments)
+                return plain(*arguments)
 
 
 def kind_of(sensor) -> tuple:
@@ -244,8 +249,9 @@ def kind_of(sensor) -> tuple:
     return sensor.class_name(), bool(sensor.needs_aperture_sample()), sensor.shutter_open_time() > 0
 
 
-def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixels: int, n_lanes: int) -> Callable:
-    """A function that renders one pass, to be recorded."""
+def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixels: int, n_lanes: int,
+             special=None) -> Callable:  # fmt: skip
+    """A function that renders one pass, to be recorded. `special`: a film that makes its own channels of a sample."""
 
     def render_pass(scene, sensor, rays, lights, field, samples, offset, settings):
         pixel, sample, active = samples.lanes(area, n_lanes)
@@ -257,13 +263,14 @@ def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixe
         ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
 
         L, valid, extra = estimate(scene, lights, field, sampler, ray, settings, active)
-        L = film_colour(L * weight, ray.wavelengths, active)
+        L = L * weight if special is not None else film_colour(L * weight, ray.wavelengths, active)
         ok = dr.all(dr.isfinite(L))
-        L = dr.select(ok, L, 0)
-        values = [L.x, L.y, L.z]
-        if alpha:
-            values.append(coverage(valid))
-        values.append(dr.select(ok & active, mi.Float(1), 0))
+        L, one = dr.select(ok, L, 0), dr.select(ok & active, mi.Float(1), 0)
+        if special is not None:
+            n_channels = special.create_block().channel_count()
+            values = special.prepare_sample(L, ray.wavelengths, n_channels, one, coverage(valid), active)
+        else:
+            values = [L.x, L.y, L.z, *([coverage(valid)] if alpha else []), one]
         for name, size in channels.items():
             values += [*extra[name]] if size == 3 else [mi.Float(extra[name])]
         dr.eval(values, ok)  # one kernel; the sums below would otherwise run the whole estimate again, each

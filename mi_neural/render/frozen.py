@@ -25,10 +25,19 @@ def can_freeze(sensor) -> bool:
     Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold, and `irradiancemeter` has no
     ``sample_ray``; rays of theirs are made outside of recorded functions.
     """
+    if is_special(sensor):
+        return False
     key = mi.variant(), sensor.class_name(), str(sensor) if sensor.class_name() == "BatchSensor" else ""
     if key not in _freezes:
         _freezes[key] = _records(_ray_of, sensor)
     return _freezes[key]
+
+
+def is_special(sensor) -> bool:
+    """Whether the film of a sensor makes its own channels of a sample, as `specfilm` does.
+
+    In Mitsuba 3.9.1 a function that is frozen while there is such a film fails, and what the film holds is lost."""
+    return mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special)
 
 
 def _ray_of(sensor, sample):
@@ -42,6 +51,8 @@ def can_freeze_scene(scene) -> bool:
 
     Tried where there are shapes that are not known to be fine.
     """
+    if any(is_special(s) for s in scene.sensors()):
+        return False
     return {s.class_name() for s in scene.shapes()} <= RECORDABLE or _records(_hit_in, scene)
 
 
