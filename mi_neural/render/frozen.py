@@ -37,7 +37,7 @@ def is_special(sensor) -> bool:
     """Whether the film of a sensor makes its own channels of a sample, as `specfilm` does.
 
     In Mitsuba 3.9.1 a function that is frozen while there is such a film fails, and what the film holds is lost."""
-    return mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special)
+    return isinstance(sensor, mi.Sensor) and mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special)
 
 
 def _ray_of(sensor, sample):
