@@ -400,8 +400,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
      * - ris
        - |bool|
        - Choose the one traced direction among the ``cache_samples`` that were queried, in proportion to f cos L plus a
-         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Was worth
-         its time in one of seven scenes measured (``mi-neural doc speed``). (Default: false)"""
+         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. It
+         paid in one of seven scenes (``mi-neural doc measured``). (Default: false)"""
     + INCIDENT_KEYS
     + SHARED_KEYS
     + INCIDENT_PRESETS
