@@ -393,7 +393,7 @@ def _environment(facts: SceneFacts, request: Request) -> Decision:
 
 def _reliability(request: Request) -> Decision:
     if request.blend in ("reliability", "switch"):
-        return modelled(True, f"blend is {request.blend}: two sets of weights, and statistics by place which agrees better")
+        return modelled(True, f"blend is {request.blend}: two sets of weights, compared by place")
     if request.blend == "control":
         return modelled("alpha", "the cache is a control variate: its coefficient is measured by place")
     return left_out("queries use one set of weights")
