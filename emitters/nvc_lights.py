@@ -58,38 +58,38 @@ class NVCLightSampler(LightSampler):
     Choice of lights by learned visibility (:monosp:`nvc_lights`)
     -------------------------------------------------------------
 
-    Chooses light :math:`i` with a probability proportional to what it would give the surface without shadows, times
-    the share of it that is visible from there as a small network predicts (neural visibility cache; Bokšanský and
-    Meister 2025, section 3):
+    Chooses light :math:`i` with a probability proportional to its unshadowed light on the surface, times the share of
+    it that is visible from there, which a small network predicts (neural visibility cache; Bokšanský and Meister 2025,
+    section 3):
 
     .. math:: p_i(x) \propto E_i(x) \max(V_i(x), f),
 
-    :math:`f` the key ``floor``. :math:`E_i` bounds the irradiance from light *i* by its distance, size and the cosines
-    at both ends (Conty Estevez and Kulla 2018). Unbiased whatever the network predicts, since no light that can
-    contribute has probability 0. With more lights than ``outputs`` the network has outputs for clusters of them: a
-    cluster is chosen as above, then one light in it by resampling ``candidates`` of its lights.
+    where :math:`f` is the key ``floor``. :math:`E_i` bounds the irradiance from light *i* by its distance, size and the
+    cosines at both ends (Conty Estevez and Kulla 2018). The choice is unbiased whatever the network predicts, since no
+    light that can contribute has probability 0. With more lights than ``outputs`` the network has outputs for clusters
+    of them: a cluster is chosen as above, then one light in it by resampling ``candidates`` of its lights.
 
     .. pluginparameters::
 
      * - preset
        - |string|
-       - ``measured``: the defaults below. ``paper``: the constants as printed; keys that are given go before it. The
-         list below has both. (Default: measured)
+       - ``measured``: the defaults below. ``paper``: the constants as printed. A key that you set overrides the preset.
+         The list below has both. (Default: measured)
      * - outputs
        - |int|
-       - Most outputs of the network; up to that many lights are known one by one. (Default: 32)
+       - Largest number of outputs of the network; so many lights have an output each. (Default: 32)
      * - clusters
        - |string|
        - What an output is for where there are more lights than outputs: ``kmeans`` (near each other), ``emitter`` (all
          triangles of an emitter), ``auto`` (by emitter if there are few, small ones). (Default: auto)
      * - environment_cells
        - |int|
-       - Parts of the environment that the network has an output for each, beside ``outputs``; 0: the environment is one
-         light, and Mitsuba chooses a direction in it. 32 of them have a quarter less noise in a room lit through
+       - Number of parts of the environment with an output each, beside ``outputs``; 0: the environment is one light,
+         and Mitsuba chooses a direction in it. 32 of them have a quarter less noise in a room lit through
          windows, and cost as much in time (``mi-neural doc measured``). (Default: 0)
      * - candidates
        - |int|
-       - Lights of a cluster that one is resampled from. (Default: 16)
+       - Number of lights of a cluster from which one is resampled. (Default: 16)
      * - in_media
        - |string|
        - How lights are chosen in scenes with participating media, where each has an output of its own. ``cells``: by a
@@ -97,7 +97,7 @@ class NVCLightSampler(LightSampler):
          weights at the point itself, which takes longer. (Default: cells)
      * - visibility
        - |bool|
-       - Use the network. false: choose by unshadowed light alone, nothing is trained. (Default: true)
+       - Use the network. false: choose by unshadowed light alone; nothing is trained. (Default: true)
      * - train_frames
        - |int|
        - Training steps before the first image. (Default: 32)
@@ -116,7 +116,7 @@ class NVCLightSampler(LightSampler):
        - Share of these points that lie anywhere in the box of what is seen; the others lie on surfaces. (Default: 0.25)
      * - vertices
        - |int|
-       - The surfaces are those at the first vertices of camera paths, up to this number of vertices. (Default: 3)
+       - The other points lie on surfaces at the first so many vertices of camera paths. (Default: 3)
      * - first_rate, last_rate
        - |float|
        - Learning rates of Adam at a place that is new, and at one that has been trained ``rate_steps`` times.
@@ -138,10 +138,10 @@ class NVCLightSampler(LightSampler):
        - Factor of that number from level to level. (Default: 1.7)
      * - init
        - |string|
-       - Of the network's weights: ``uniform`` (Dr.Jit's), or ``he``. (Default: uniform)
+       - Initial weights of the network: ``uniform`` (Dr.Jit's), or ``he``. (Default: uniform)
      * - floor
        - |float|
-       - Smaller visibilities are raised to it. (Default: 0.06)
+       - Smallest visibility that counts; smaller predictions are raised to it. (Default: 0.06)
      * - cluster_choice
        - |string|
        - Weight of a cluster of several lights: ``received``, what it would give times its visibility, or
@@ -157,7 +157,7 @@ class NVCLightSampler(LightSampler):
        - Of the initial weights, the training points and the clusters. (Default: 0)
      * - plan
        - |string|
-       - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
+       - ``scene``: build only what the scene needs. ``everything``: build all parts, to compare and to look for
          faults. (Default: scene)
 
     The presets: the published value (Bokšanský and Meister 2025, sections 3.2 to 3.4 and figure 5; values behind a
@@ -183,7 +183,7 @@ class NVCLightSampler(LightSampler):
     32 leaky rectifiers (0.01) and the sigmoid are the paper's in both presets.
 
     *Works with* all emitters of Mitsuba; point, spot and directional lights, meshes of thousands of emissive triangles
-    and the environment can be mixed. With a single light it costs nothing. Points in a participating
+    and the environment can be mixed. With a single light nothing is built. Points in a participating
     medium count light from all directions alike, and boundaries of media are no walls. *Leaves out* what media absorb
     on the way, phase functions, and glossy lobes: surfaces weigh lights by irradiance (with the lobes by linearly
     transformed cosines a choice takes 2 to 2.6 times as long; variance 0.98 of this on a staircase, 0.67 between

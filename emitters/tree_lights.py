@@ -28,7 +28,7 @@ class TreeLightSampler(LightSampler):
 
      * - plan
        - |string|
-       - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
+       - ``scene``: build only what the scene needs. ``everything``: build all parts, to compare and to look for
          faults. (Default: scene)
 
     The tree is built by the surface area orientation heuristic with 12 bins, and anew when lights change. A light is

@@ -20,11 +20,11 @@ class UniformLightSampler(LightSampler):
 
      * - plan
        - |string|
-       - ``scene``: build only what the scene needs. ``everything``: whatever it needs, to compare and to look for
+       - ``scene``: build only what the scene needs. ``everything``: build all parts, to compare and to look for
          faults. (Default: scene)
 
     *Works with* all emitters of Mitsuba, nested in an integrator of this package under the name ``light_sampler``.
-    Better in nearly every scene: ``nvc_lights``.
+    Nearly every scene has less noise with ``nvc_lights``.
 
     .. tabs::
         .. code-tab:: xml

@@ -12,25 +12,26 @@ from mi_neural.integrators.common import CacheIntegrator
 INCIDENT_KEYS = """
      * - preset
        - |string|
-       - ``measured``: the defaults below. ``paper``: the constants as printed; keys that are given go before it. The
-         list below has both. (Default: measured)
+       - ``measured``: the defaults below. ``paper``: the constants as printed. A key that you set overrides the preset.
+         The list below has both. (Default: measured)
      * - inputs
        - |string|
        - What the network gets of a surface beside position and direction: a list of ``normal``, ``albedo``,
          ``roughness``, or ``none``. (Default: none)
      * - direction_degree
        - |int|
-       - Of the spherical harmonics of the direction, 0 to 7. (Default: 3)
+       - Degree of the spherical harmonics of the direction, 0 to 7. (Default: 3)
      * - loss
        - |string|
-       - What training lessens: the squared error over ``local``, the squared mean prediction over the hemisphere at the
-         record's position; ``weighted``, that of the record itself, error and prediction times the throughput f cos/p
-         of its direction, and all times p. (Default: local)
+       - Loss of training, a relative squared error. ``local`` divides the squared error by the squared mean prediction
+         over the hemisphere at the record's position. ``weighted``, as published, divides by the squared prediction for
+         the record itself; error and prediction are multiplied by the throughput f cos/p of its direction, and the
+         quotient by p. (Default: local)
      * - local_limit
        - |float|
-       - Of ``loss="local"``: the mean prediction of a place counts as at most so many times the mean target of the
-         scene, but at least as half of itself. Places between then weigh alike, and their errors upwards as much as
-         those downwards. (Default: 8)"""
+       - For ``loss="local"``: in the divisor the mean prediction of a place counts as at most so many times the mean
+         target of the scene, but at least as half of itself. So bright places have the same weight up to a limit.
+         (Default: 8)"""
 
 #: The list of the constants of both presets, for the docstrings
 INCIDENT_PRESETS = """

@@ -112,28 +112,29 @@ SHARED_KEYS = (
        - Leave out what the camera sees of emitters directly. (Default: false)
      * - train_frames
        - |int|
-       - Training frames before the first image; -1: until the loss settles, 128 to 400. (Default: -1)
+       - Training frames before the first image; -1: until the loss hardly falls any more, 128 to 400. (Default: -1)
      * - train_samples
        - |int|
        - Training paths per frame; -1: one for each 8x8 pixels of the film. (Default: 4096, ``nrc`` and ``neural_path``
          2048, on a GPU 8192)
      * - train_vertices
        - |int|
-       - Vertices of a training path, each but the last a record; it ends in the cache itself. (Default: 8)
+       - Vertices of a training path. Each but the last is a record; at the last the cache itself is read. (Default: 8)
      * - train_steps
        - |int|
        - Training frames before each later image, so that the cache follows a changing scene. (Default: 1)
      * - learning_rate
        - |float|
-       - Of Adam, at the start; falls to a tenth. (Default: 0.01, ``nrc`` and ``neural_path`` 0.06, but ``nrc`` 0.01
-         with a ``blend`` other than ``ema``)
+       - Learning rate of Adam at the start; it falls by ``last_rate``. (Default: 0.01, ``nrc`` and ``neural_path``
+         0.06, but ``nrc`` 0.01 with a ``blend`` other than ``ema``)
      * - epsilon
        - |float|
-       - Of the loss, which is relative: added to the square that the error is divided by, in units of the squared mean
-         radiance of the scene. (Default: 10, ``nrc`` and ``neural_path`` 1)
+       - The loss is relative: epsilon is added to the square by which it divides, in units of the squared mean radiance
+         of the scene. (Default: 10, ``nrc`` and ``neural_path`` 1)
      * - ema_decay
        - |float|
-       - Decay per frame of the averaged weights that queries use, once training is old enough. (Default: 0.99)
+       - Decay per training frame of the averaged weights that queries use. It is less in the first frames. (Default:
+         0.99)
      * - ema_debiased
        - |bool|
        - Average over all steps so far, with weights that fall by ``ema_decay`` a step, as published; false: over the
@@ -143,68 +144,69 @@ SHARED_KEYS = (
        - Do not train at all; an untrained cache predicts a constant. (Default: false)
      * - gradient
        - |string|
-       - Where derivatives of images come from, as in ``dr.backward(mi.render(scene, params, integrator=...))``.
-         ``cache``: paths that read the incident radiance at each vertex from the cache: little noise, as much bias as
-         the cache has. ``prb``: Mitsuba's ``prb`` with the same ``max_depth``, ``rr_depth`` and ``hide_emitters``:
-         unbiased. Shapes and sensors always take the latter. (Default: cache; in ``nirc_two_level`` prb)
+       - How derivatives of images are computed (``dr.backward(mi.render(scene, params, integrator=...))``). ``cache``:
+         paths read the light at each vertex from the cache; little noise, and the bias of the cache. ``prb``:
+         Mitsuba's ``prb`` with the same ``max_depth``, ``rr_depth`` and ``hide_emitters``; unbiased. Derivatives of
+         shapes and sensors always use ``prb``. (Default: cache; in ``nirc_two_level`` prb)
      * - seed
        - |int|
-       - Of the initial weights and the training paths. (Default: 0)
+       - Seed of the initial weights and the training paths. (Default: 0)
      * - levels
        - |int|
        - Levels of the hash grid, two features each. (Default: 8)
      * - hashmap_size
        - |int|
-       - Most entries of a level. (Default: 32768)
+       - Largest number of entries of a level. (Default: 32768)
      * - width
        - |int|
-       - Of the network's hidden layers. (Default: 32)
+       - Width of the network's hidden layers. (Default: 32)
      * - hidden_layers
        - |int|
-       - Their number. (Default: 2)
+       - Number of hidden layers. (Default: 2)
      * - blend
        - |string|
-       - Which weights answer. ``ema``: their average, least noise, lags behind changes. ``fast``: those being trained.
-         ``reliability``: (1 - σ) average + σ trained, σ by place from how both agree with the training records; as
-         quick as ``fast`` where light changes, as still as ``ema`` elsewhere. ``switch``: the same with σ rounded to 0
-         or 1. For scenes that change; in still ones ``ema`` is best. (Default: ema)
+       - Which weights queries use. ``ema``: their average over training frames; least noise, but late after a change.
+         ``fast``: the weights being trained. ``reliability``: (1 - σ) times the average's prediction plus σ times that
+         of the trained weights; σ depends on the place and on how well both agree with the training records. It
+         follows a change as ``fast`` does, with the noise of ``ema`` elsewhere. ``switch``: the same with σ rounded to
+         0 or 1. In scenes that do not change ``ema`` is best. ``neural_path`` has ``ema`` alone. (Default: ema)
      * - reliability
        - |string|
-       - How σ is found: ``evidence`` (a test whether the trained weights are better), ``correlation``, ``concordance``,
-         ``regression``. (Default: evidence)
+       - How σ is computed: ``evidence`` (a test whether the trained weights are better), ``correlation`` (as
+         published), ``concordance``, ``regression``. (Default: evidence)
      * - reliability_normals
        - |bool|
        - Keep statistics apart by the six main directions of the normal. (Default: false)
      * - reliability_decay
        - |float|
-       - What a frame leaves of the statistics before it, λ, in [0, 1). (Default: 0.9)
+       - Decay λ of the statistics per frame, in [0, 1). (Default: 0.9)
      * - reliability_warm_up
        - |int|
-       - Training frames in which σ stays 0, K. (Default: 128)
+       - Number K of training frames at the start in which σ stays 0. (Default: 128)
      * - reliability_kappa
        - |float|
-       - Gain κ of σ by how far the two predictors' ``correlation`` or ``concordance`` with the records are apart.
-         (Default: 4)
+       - How sharply σ decides: factor κ of the difference between the two predictors' ``correlation`` or
+         ``concordance`` with the records. (Default: 4)
      * - reliability_epsilon
        - |float|
-       - ε, added to variances by ``correlation`` and ``concordance``, in units of the squared mean radiance of the
-         scene. (Default: 0.001)
+       - Constant ε that ``correlation`` and ``concordance`` add to variances, in units of the squared mean radiance of
+         the scene. (Default: 0.001)
      * - reliability_resolution
        - |int|
-       - Cells of the statistics along the longest axis of the box where records fall. (Default: 16)
+       - Number of cells of the statistics along the longest axis of the box of the records. (Default: 16)
      * - last_rate
        - |float|
-       - Share of ``learning_rate`` that it falls to. (Default: 0.1 with ``ema``, else 1: the trained weights must be
-         quick)
+       - Share of ``learning_rate`` at the end of its fall. (Default: 0.1 with ``ema``, else 1, so that the trained
+         weights follow a change)
 """
     + LIGHT_SAMPLER_KEY.strip("\n")
     + """
      * - plan
        - |string|
-       - What is built. ``scene``: what the scene needs (``mi-neural plan SCENE`` says what and why; keys of this table
-         have the last word). ``everything``: whatever it needs, to compare and to look for faults. (Default: scene)
+       - What is built. ``scene``: what the scene needs; keys of this table override it, and ``mi-neural plan SCENE``
+         says what is built and why. ``everything``: all parts, to compare and to look for faults. (Default: scene)
      * - channels
        - |string|
-       - Extra channels to write, a comma-separated list; the plugin says which. (Default: none)
+       - Extra channels to write, a comma-separated list of those named below. (Default: none)
 """
 )

@@ -167,33 +167,33 @@ NeuralPathIntegrator.__doc__ = (
     r"""
     .. _integrator-neural_path:
 
-    Path tracer that ends in neural caches (:monosp:`neural_path`)
-    --------------------------------------------------------------
+    Path tracer that ends in a neural cache (:monosp:`neural_path`)
+    ---------------------------------------------------------------
 
     Estimates all light with little noise and a small bias that vanishes as samples are added. It is the integrator to
     take where no reason speaks for another. It has a cache of outgoing radiance (as ``nrc``), and measures while
     training how wrong the cache is, without a reference and without further rays.
 
     Training paths are traced in pairs from the same first vertex, so that two independent estimates T, T' of the same
-    radiance exist. Over such pairs the mean of (A - T)(A - T') is the squared bias :math:`b^2` of the cache's answer A,
-    and that of (T - T')²/2 the noise v of tracing on, both by cells of 1/16 of the box. For an image of N samples a
-    pixel:
+    radiance exist. Over such pairs the mean of (A - T)(A - T') is the squared bias :math:`b^2` of the cache's
+    prediction A, and that of (T - T')²/2 the noise v of tracing on, both by cells of 1/16 of the box. For an image of N
+    samples a pixel:
 
-    - First surface: the cache's answer is mixed with what is traced, by the weight of least squared error,
+    - First surface: the cache's prediction is mixed with what is traced, by the weight of least squared error,
       :math:`v/N / (v/N + b^2)`.
     - Later vertices: the path ends in the cache where it is wide. The threshold c of the spread test grows with N, so
       that many samples trace further before they end.
 
-    So the first samples show the cache, more samples trust it less, and :math:`E[L_o]` tends to the path-traced
-    radiance. A denoiser removes noise, but no bias: for an image that is to be denoised, set ``denoised``.
-    ``mi-neural`` does with ``--denoise``.
+    So an image of few samples mainly shows the cache. With more samples its weight falls, and :math:`E[L_o]` tends to
+    the path-traced radiance. A denoiser removes noise, but no bias: for an image that will be denoised, set
+    ``denoised``. ``mi-neural`` sets it with ``--denoise``.
 
     .. pluginparameters::
 
      * - denoised
        - |bool|
-       - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and it
-         is raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` where that is more, b²/v being the mean of the scene.
+       - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and is
+         raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` where that is more, b²/v being the mean of the scene.
          (Default: false)
      * - spread_threshold
        - |float|
@@ -202,9 +202,9 @@ NeuralPathIntegrator.__doc__ = (
     + OUTGOING_KEYS
     + SHARED_KEYS
     + r"""
-    An image to be rendered in a given time (``train_seconds``, ``mi-neural render --seconds``) is path-traced where the
-    training has no time for 24 steps: before that a cache does more harm than good. ``statistics()`` then has
-    ``cache_left_out``.
+    An image that must be rendered in a given time (``train_seconds``, ``mi-neural render --seconds``) is path-traced if
+    there is no time for 24 training steps, because a younger cache adds more error than it removes. ``statistics()``
+    then has ``cache_left_out``.
 
     Channels: ``traced``, ``cached`` (RGB each; with visible emission in ``traced`` they sum to the image), ``cache``
     (RGB: the outgoing cache seen directly at the first vertex), ``share`` (its weight there), ``depth`` (segments up to
@@ -217,7 +217,7 @@ NeuralPathIntegrator.__doc__ = (
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
-    polarization, spectral rendering, ``blend`` (use ``nrc``).
+    polarization, spectral rendering, and ``blend`` other than ``ema`` (use ``nrc``).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.

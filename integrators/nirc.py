@@ -353,28 +353,28 @@ NIRCIntegrator.__doc__ = (
     .. math:: L_o = L_e + L_{direct} + \frac{1}{N_c} \sum_i \frac{L_{cache}(x, \omega_i) f \cos\theta_i}{p(\omega_i)}
               + \frac{1}{N_l} \sum_j u_j \frac{(L_{gather} - L_{cache})(x, \omega_j) f \cos\theta_j}{p(\omega_j)}.
 
-    The last sum runs over the directions that were traced for direct light anyway. It replaces the cache's answer by
-    what is gathered one vertex later (next-event estimation there, the rest from the cache there), with a share
+    The last sum runs over the directions that were traced for direct light anyway. It replaces the cache's prediction
+    by what is gathered one vertex later (next-event estimation there, the rest from the cache there), with a share
     :math:`u` that is 1 for mirrors, sharp lobes and surfaces so near that the cache would blur what the pixel sees, and
     elsewhere depends on ``termination``. :math:`E[L_o]` is the path-traced radiance if the cache is exact.
 
-    What the cache holds: light reflected at least once, next-event estimation included. What it does not: emission.
+    The cache holds light that was reflected at least once, next-event estimation included. It does not hold emission.
 
     .. pluginparameters::
 
      * - termination
        - |string|
-       - How a camera sample uses the cache. By the sums above, u of far light being 0 with ``primary`` (least noise,
-         most bias), 1 with ``spread``, and 1 - t with ``balanced_shares``, where t = Nc p_f / (Nc p_f + p_g) and
-         :math:`p_f = 1/\pi`. Or by a path that stops at a vertex and asks the cache there for the light from the
-         direction of its BSDF sample, without a ray: with ``balanced`` at each vertex with the probability t
-         (Dereviannykh et al.). ``adaptive``: by the sums, u being 0 for one sample a pixel and growing with the image's
-         sample count, as noise gives way to bias; with ``denoised`` by a path that stops at the first vertex where its
-         spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4). Where paths stop, ``light_samples`` says nothing.
-         (Default: adaptive)
+       - How a camera sample uses the cache. With ``primary``, ``spread`` and ``balanced_shares`` by the sums above: the
+         share u of far light is 0 with ``primary`` (least noise, most bias), 1 with ``spread``, and 1 - t with
+         ``balanced_shares``, where t = Nc p_f / (Nc p_f + p_g) and :math:`p_f = 1/\pi`. With ``balanced`` a path stops
+         at each vertex with the probability t, and queries the cache there for the light from the direction of its BSDF
+         sample, without a ray (Dereviannykh et al.). ``adaptive``: by the sums; u is 0 for one sample a pixel and grows
+         with the number of samples, because then noise falls and bias remains. With ``adaptive`` and ``denoised`` a
+         path stops at the first vertex where its spread a exceeds c a_0 (Müller et al. 2021, sec. 3.4). Where paths
+         stop, ``light_samples`` has no effect. (Default: adaptive)
      * - denoised
        - |bool|
-       - The image will be denoised: that removes noise, but no bias. See ``termination``. ``mi-neural`` sets it with
+       - The image will be denoised, which removes noise but no bias; see ``termination``. ``mi-neural`` sets it with
          ``--denoise``. (Default: false)
      * - cache_samples
        - |int|
@@ -384,16 +384,16 @@ NIRCIntegrator.__doc__ = (
        - |string|
        - What the cache is. ``network``: hash grid and MLP. Two controls without a network: ``spatial_hash``, means of
          the records by cell and direction, and ``sh_grid``, spherical harmonics on a hash grid; of the sizes they take
-         ``levels`` and ``hashmap_size`` alone, with defaults of their own. ``plan``: what the plan says, which is the
-         network (README: measured). (Default: plan)
+         ``levels`` and ``hashmap_size`` alone, with defaults of their own. ``plan``: as the plan says, which is the
+         network (``mi-neural doc measured`` compares them). (Default: plan)
      * - light_samples
        - |int|
        - Emitter samples, and traced BSDF samples :math:`N_l`, at the first vertex per camera sample. -1: 1, 2 or 4, by
          the noise of direct light, which is measured once per scene. (Default: -1)
      * - spread_threshold
        - |float|
-       - Constant c of the spread test a > c a_0; 0: no surface is too near. Of paths that stop it is raised to N/256
-         where that is more, N being the samples a pixel. (Default: 0.01; of paths that stop 1)
+       - Constant c of the spread test a > c a_0; 0: no surface is too near. For paths that stop (see ``termination``)
+         it is at least N/256, N being the samples a pixel. (Default: 0.01; for paths that stop 1)
      * - gather_half
        - |float|
        - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)"""
@@ -407,9 +407,9 @@ NIRCIntegrator.__doc__ = (
     direct light alone not counted.
 
     *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``plain_path``), polarization, spectral rendering, and a limit to the number of bounces
-    inside the cache (use ``path``). Thin walls between very bright and dark places leak until some 300 frames were
-    trained (use ``spread``).
+    participating media (use ``neural_path``), polarization, spectral rendering, and a limit to the number of bounces
+    inside the cache (use ``path``). Light of very bright places shows through thin walls until some 300 frames were
+    trained (use ``termination="spread"``).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.

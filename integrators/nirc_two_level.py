@@ -338,33 +338,33 @@ NIRCTwoLevelIntegrator.__doc__ = (
     Two-level estimator with a neural incident radiance cache (:monosp:`nirc_two_level`)
     ------------------------------------------------------------------------------------
 
-    Estimates all light without bias, whatever the cache says: at the first surface that is not a mirror, direct light
-    is traced as in ``path``, indirect light is the cache's answer and the traced difference to it (Dereviannykh et al.
-    2025, "Neural Two-Level Monte Carlo Real-Time Rendering", the two-level estimator):
+    Estimates all light without bias, whatever the cache predicts: at the first surface that is not a mirror, direct
+    light is traced as in ``path``; indirect light is the cache's prediction plus the traced difference from it
+    (Dereviannykh et al. 2025, "Neural Two-Level Monte Carlo Real-Time Rendering", the two-level estimator):
 
     .. math:: L_o = L_e + L_{direct}
               + \frac{1}{N_c} \sum_i \frac{\alpha L_{cache}(x, \omega_i) f \cos\theta_i}{p(\omega_i)}
               + \frac{1}{N_r} \sum_j \frac{(L - \alpha L_{cache})(x, \omega_j) f \cos\theta_j}{p(\omega_j)}.
 
-    :math:`E[L_o]` does not depend on the cache: trained, untrained or nonsense, it changes the variance alone. Emission
-    met by a BSDF ray carries its MIS weight and is no part of the sums; mirrors and sharp lobes are always traced.
+    :math:`E[L_o]` does not depend on the cache; the cache changes the variance only. Emission that a BSDF ray hits has
+    its MIS weight and is no part of the sums. Mirrors and sharp lobes are always traced.
 
     On a CPU a query costs a tenth to a third of a path, and most of the variance lies in the paths' far ends, of which
     the cache predicts nothing. So this integrator *measures*. Four keys divide a camera sample; those that are not set
     are chosen by a pilot, which renders some rows with each division and takes the one of least variance times time.
-    Path tracing is one of the divisions, at its own cost; small images always get it. ``statistics()["pilot"]`` shows
-    the numbers; ``measure(scene)`` has them taken at once. Random numbers of the first vertex are stratified over a
+    Path tracing is one of the divisions; small images always use it. ``statistics()["pilot"]`` shows the numbers;
+    ``measure(scene)`` measures them at once. Random numbers of the first vertex are stratified over a
     pixel's samples (Owen-scrambled Sobol), and packets of neighbouring pixels decide together where paths end.
 
     .. pluginparameters::
 
      * - mode
        - |string|
-       - ``unbiased``, or ``progressive``: most samples are those of ``nirc``, which share the cache, and the more of
-         them unbiased ones the more bias is found; the image is the biased one plus that part of the unbiased one's
-         difference, scale by scale, that stands out of its noise; biased, and consistent: it tends to the unbiased
-         image. For "the best image in T seconds". The unbiased part is path tracing there, unless the keys below say
-         otherwise. (Default: unbiased)
+       - ``unbiased``, or ``progressive``, for the best image in a given time: most samples are those of ``nirc`` with
+         the same cache, the others are unbiased. The more bias is measured, the more samples are unbiased. The
+         difference of both images is added to the biased one, scale by scale, as far as it exceeds its noise. The
+         result is biased, and tends to the unbiased image. The unbiased samples are path tracing, unless the keys below
+         say otherwise. (Default: unbiased)
      * - cache_samples
        - |int|
        - Directions :math:`N_c` in which the cache is queried per camera sample, those that are traced included. 0: path
@@ -400,8 +400,8 @@ NIRCTwoLevelIntegrator.__doc__ = (
      * - ris
        - |bool|
        - Choose the one traced direction among the ``cache_samples`` that were queried, in proportion to f cos L plus a
-         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. Was worth
-         its time in one of seven scenes measured (``mi-neural doc speed``). (Default: false)"""
+         defensive share (resampled importance sampling); MIS goes on with the density of the candidates. It
+         paid in one of seven scenes (``mi-neural doc measured``). (Default: false)"""
     + INCIDENT_KEYS
     + SHARED_KEYS
     + INCIDENT_PRESETS

@@ -98,25 +98,25 @@ NRCIntegrator.__doc__ = (
     vertex is the one seen through them, and none of them is a terminal vertex. :math:`E[L_o]` is the path-traced
     radiance if the cache is exact.
 
-    What the cache holds: the light that a surface reflects, direct light included (``cache_content``). What it does
-    not: emission, which is counted at the vertex before, with its MIS weight, and so never twice.
+    The cache holds the light that a surface reflects, direct light included (``cache_content``). It does not hold
+    emission, which is counted at the vertex before with its MIS weight.
 
-    Training paths begin as those of pixels do, or at places that earlier ones have met; they go on beyond the terminal
-    vertex until they have become as wide once more, where the cache completes them (self-training), and each vertex is
-    a record. One in 4, in scenes with media each, runs on without (``unbounded_share``). The reflectance is factored
-    out of the records and multiplied back.
+    Training paths begin as those of pixels do, or at the records of earlier frames. They go on beyond the terminal
+    vertex until they have become as wide once more. There the cache itself is read (self-training). Each vertex is a
+    record. One path in 4, and each in scenes with media, runs on to its natural end (``unbounded_share``). The
+    reflectance is factored out of the records and multiplied back.
 
     .. pluginparameters::
 
      * - preset
        - |string|
-       - ``measured``: the defaults below. ``paper``: the constants as printed; keys that are given go before it. The
-         list below has both. (Default: measured)
+       - ``measured``: the defaults below. ``paper``: the constants as printed. A key that you set overrides the preset.
+         The list below has both. (Default: measured)
      * - spread_threshold
        - |float|
-       - The constant c: 0 asks the cache at the first surface that is not a mirror, infinity never (``nrc`` is a path
-         tracer). An SDK defines :math:`a_0` as :math:`4\pi |x_0-x_1|^2 / |\cos\theta_1|`, 158 times as large: give
-         158 times its constant. (Default: 0.01)
+       - The constant c. With 0 the cache is queried at the first surface that is not a mirror, with infinity never
+         (``nrc`` is a path tracer). An SDK defines :math:`a_0` as :math:`4\pi |x_0-x_1|^2 / |\cos\theta_1|`, 158
+         times as large: give 158 times its constant. (Default: 0.01)
      * - cache_content
        - |string|
        - What the cache holds. ``reflected``: all reflected light. ``indirect``: without direct light, which is traced

@@ -36,7 +36,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
     Direct light by neural visibility (:monosp:`nvc_direct`)
     --------------------------------------------------------
 
-    Emission, and direct light at the first surface that is not a mirror; mirrors and glass on the way are followed.
+    Estimates emission, and direct light at the first surface that is not a mirror. Mirrors and glass are followed.
     With ``mode="sampled"`` each shadow ray goes to a light that the ``light_sampler`` chooses, by default one that has
     learned which lights are visible from where, and a BSDF ray is weighted against it: unbiased, whatever was learned.
     With ``mode="neural"`` there are no shadow rays: all lights are summed, each as it would be without shadows, times
@@ -44,16 +44,16 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
 
     .. math:: L = L_e + \sum_k V_k(x) \int f L_k \cos\theta\, d\omega,
 
-    free of noise at the first vertex, but biased: shadows are as sharp as the network's grid, areas of a light are not
-    told apart, and glossy lobes are linearly transformed cosines. For previews.
+    This has no noise at the first vertex, but a bias: shadows are as sharp as the network's grid, parts of a light have
+    the same visibility, and glossy lobes are linearly transformed cosines. It is meant for previews.
 
     .. pluginparameters::
 
      * - preset
        - |string|
        - ``measured``: the defaults below. ``paper``: the constants as printed, of the ``radiance`` cache, and of the
-         ``nvc_lights`` where no ``light_sampler`` is nested; keys that are given go before it. The list below has both.
-         (Default: measured)
+         ``nvc_lights`` where no ``light_sampler`` is nested. A key that you set overrides the preset. The list
+         below has both. (Default: measured)
      * - mode
        - |string|
        - ``sampled`` (unbiased) or ``neural`` (no shadow rays; no more lights than the light sampler has outputs).
@@ -95,8 +95,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
          orientations would; the others lie on surfaces that the camera sees. (Default: 0)
      * - loss
        - |string|
-       - What its training lessens: the squared error, ``relative`` to the squared prediction, or ``squared`` alone.
-         (Default: relative)
+       - Its loss: the squared error, ``relative`` to the squared prediction, or ``squared`` alone. (Default: relative)
      * - first_rate, last_rate
        - |float|
        - Its learning rates, at a place that is new, and at one that has been trained ``rate_steps`` times. (Default:

@@ -26,21 +26,21 @@ OUTGOING_KEYS = """
          plan)
      * - train_records
        - |int|
-       - Most records of a training frame; of what is beyond, the last vertices of paths are left out. (Default: three
-         times ``train_samples``)
+       - Largest number of records of a training frame. If there are more, the last vertices of paths are left out.
+         (Default: three times ``train_samples``)
      * - train_suffix
        - |string|
        - Where training paths end: ``spread``, at the second vertex where the path has become wide, or ``full``, at
          ``train_vertices`` whatever the spread. (Default: spread)
      * - world_share
        - |float|
-       - Share of the training paths that start where records of all earlier frames lay, so that what leaves the view
-         is not forgotten. (Default: 0.25)
+       - Share of the training paths that start at records of earlier frames, so that the cache keeps what leaves the
+         view. (Default: 0.25)
      * - unbounded_share
        - |float|
-       - Share of the training paths that run on to their natural end, without self-training: more where light enters
-         by many reflections, and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised`` 0.5.
-         In scenes with media 1, of ``neural_path`` without ``denoised`` 0.25)
+       - Share of the training paths that run on to their natural end, without self-training. Set more where light
+         enters by many reflections and the cache starts too dark. (Default: 0.25, of ``neural_path`` with ``denoised``
+         0.5. In scenes with media 1, of ``neural_path`` without ``denoised`` 0.25)
      * - roughening
        - |float|
        - Share of each surface's BSDF that becomes Lambertian with each bounce of a training path (none at its first

@@ -55,8 +55,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 
     Estimates emission and direct light at the first surface, as ``path`` does with ``max_depth = 2``, for the frames of
     a running sequence: each pixel keeps one light sample, chosen among candidates of its own, what it kept in the frame
-    before and what its neighbours keep (Bitterli et al. 2020). Without bias by default, while geometry and materials
-    stand still; the camera may move and the lights may change. With :math:`y` the kept sample (a light, and two numbers
+    before and what its neighbours keep (Bitterli et al. 2020). The default has no bias while geometry and materials do
+    not change; the camera may move and the lights may change. With :math:`y` the kept sample (a light, and two numbers
     :math:`u` that choose a point on it),
 
     .. math:: L_o = L_e + w_b \frac{f L_e \cos\theta}{p_b} + w_l \frac{f L_e V \cos\theta}{p(y \mid u)} \, W_y, \qquad
@@ -75,20 +75,21 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     shown: 3 rays, and ``unbiased`` remains so.
 
     One frame is one sample a pixel. A ``render`` call with ``spp`` samples renders so many frames and returns their
-    mean; their noise is correlated, so that ``restir_di`` is for one or few samples a pixel.
+    mean. The noise of these frames is correlated, so ``restir_di`` is for one or few samples a pixel.
 
     .. pluginparameters::
 
      * - preset
        - |string|
        - ``measured``: the defaults below. ``paper``: the constants as printed, of the ``nvc_lights``, too, where no
-         ``light_sampler`` is nested; keys that are given go before it. The list below has both. (Default: measured)
+         ``light_sampler`` is nested. A key that you set overrides the preset. The list below has both. (Default:
+         measured)
      * - initial_candidates
        - |int|
        - Light samples that a pixel chooses from in each frame. (Default: 8)
      * - candidate_shadow_ray
        - |bool|
-       - Whether the winner among these sends a shadow ray and is left out where that is blocked. (Default: true)
+       - Whether the chosen one of these sends a shadow ray, and is left out if it is blocked. (Default: true)
      * - candidates
        - |string|
        - ``light``: in proportion to power; ``nvc``: as the nested ``light_sampler`` chooses, ``nvc_lights`` if there is
@@ -103,10 +104,10 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
          ``uniform_lights``. (Default: none, see ``candidates``)
      * - history
        - |float|
-       - Confidence of what was kept in the frame before, in frames, at most; 0: no reuse over frames. (Default: 20)
+       - Largest confidence of the sample kept in the frame before, in frames; 0: no reuse over frames. (Default: 20)
      * - spatial_samples
        - |int|
-       - Neighbours that a pixel looks at; 0: no reuse over pixels. (Default: 4)
+       - Number of neighbours whose samples a pixel reuses; 0: no reuse over pixels. (Default: 4)
      * - spatial_radius
        - |float|
        - They lie in a disk of this radius, in pixels; -1: a 24th of the film's height, 4 to 32. At 320x180, 8 pixels

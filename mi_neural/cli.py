@@ -1,5 +1,5 @@
-"""The command `mi-neural`: render a scene, compare integrators at equal time or over a changing scene, say what
-a scene needs and what is installed.
+"""Render Mitsuba scenes with integrators that learn their light, compare integrators at equal time or over a
+changing scene, and read the manual.
 
 Progress goes to stderr and results to stdout. Exit codes: 0 done, 2 the input cannot be used (one line says why),
 130 (Ctrl-C) and 143 (SIGTERM) interrupted, with what was rendered so far on disk.

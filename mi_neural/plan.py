@@ -349,7 +349,7 @@ def _cache(facts: SceneFacts, request: Request) -> Decision:
         return given(False, "a path tracer")
     if not (facts.smooth or facts.media or request.everything):
         return left_out(f"all of {n} surfaces are mirrors or glass")
-    why = f"{facts.smooth} of {n} surfaces reflect from all around"
+    why = f"{facts.smooth} of {n} surfaces are neither mirrors nor glass"
     if facts.media:
         why += ", and media scatter"
     return given(known, why) if "cache" in request.given else modelled(known, why)
@@ -374,10 +374,10 @@ def _light_sampler(facts: SceneFacts, request: Request) -> Decision:
     if noise.visibility < WORTH_SHARE * min(noise.power, noise.uniform):
         return modelled("nvc_lights", figures)
     if noise.power < WORTH_POWER * noise.uniform:
-        return modelled("power_lights", f"{figures}; visibility would cost what it saves")
+        return modelled("power_lights", f"{figures}; visibility would take the time that it saves")
     if exact:
         return modelled("power_lights" if noise.power < noise.uniform else "uniform_lights", f"{figures}; {exact}")
-    return left_out(f"{figures}; the scene's uniform choice will do")
+    return left_out(f"{figures}; the uniform choice of the scene is kept")
 
 
 def _environment(facts: SceneFacts, request: Request) -> Decision:
@@ -388,15 +388,15 @@ def _environment(facts: SceneFacts, request: Request) -> Decision:
         return given(cells, "there is an environment")
     if request.everything:
         return modelled(EVERY_CELL, "everything; there is an environment")
-    return left_out("visibility by direction costs what it saves (mi-neural doc measured)")
+    return left_out("visibility by direction takes the time that it saves (mi-neural doc measured)")
 
 
 def _reliability(request: Request) -> Decision:
     if request.blend in ("reliability", "switch"):
-        return modelled(True, f"blend is {request.blend}: two sets of weights are scored by place")
+        return modelled(True, f"blend is {request.blend}: two sets of weights, compared by place")
     if request.blend == "control":
-        return modelled("alpha", "the cache is a control variate: how far it is believed is measured by place")
-    return left_out(f"blend is {request.blend}: one set of weights answers everywhere")
+        return modelled("alpha", "the cache is a control variate: its coefficient is measured by place")
+    return left_out("queries use one set of weights")
 
 
 def _input(name: str, facts: SceneFacts, request: Request) -> Decision:
@@ -404,7 +404,7 @@ def _input(name: str, facts: SceneFacts, request: Request) -> Decision:
     if request.everything:
         return modelled(True, "everything")
     if name == "normal":
-        return modelled(True, "where surfaces meet, they differ in nothing else")
+        return modelled(True, "it distinguishes surfaces that meet")
     if facts.alike:
         why = f"all {facts.smooth} surfaces are Lambertian"
         return left_out(f"{why}, and light over reflectance is learned" if name == "albedo" else why)

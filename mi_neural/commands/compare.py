@@ -24,28 +24,38 @@ def compare(
         typer.Argument(metavar="SCENE", help="Mitsuba XML files, or names that mi-neural scenes lists"),
     ] = None,
     scenes: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="all scene files in a folder and below it, too")
+        Path | None, typer.Option(metavar="DIR", help="also all scene files in a folder and below it")
     ] = None,
     integrator: Annotated[
         list[str] | None,
-        typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="repeatable; default: path and nirc"),
+        typer.Option(
+            "-i",
+            "--integrator",
+            metavar="TYPE[:K=V,...]",
+            help="an integrator and its keys, for example nirc:cache_samples=8; repeatable; default: path and nirc",
+        ),
     ] = None,
     set_: options.Set = None,
     define: options.Define = None,
     seconds: Annotated[
-        str | None, typer.Option(metavar="S,S,...", help=f"one-shot budgets; default {DEFAULT_SECONDS}")
+        str | None,
+        typer.Option(metavar="S,S,...", help=f"seconds of one image from an empty cache; default {DEFAULT_SECONDS}"),
     ] = None,
-    steady: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames, then time frames")] = 0,
+    steady: Annotated[
+        int, typer.Option(metavar="FRAMES", help="train so many frames, then measure frames of a running sequence")
+    ] = 0,
     frame_seconds: Annotated[
         str | None,
-        typer.Option(metavar="S,S,...", help=f"budgets of a frame with --steady; default {DEFAULT_FRAME_SECONDS}"),
+        typer.Option(metavar="S,S,...", help=f"seconds of a frame with --steady; default {DEFAULT_FRAME_SECONDS}"),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(metavar="N", help="measure with N independent seeds: confidence intervals, bias, variance")
+        int, typer.Option(metavar="N", help="measure with N seeds: confidence intervals, bias, variance")
     ] = 1,
     size: Annotated[
         str | None,
-        typer.Option(metavar="WxH,...", help="size of the films; each scene takes the one nearest in shape to its own"),
+        typer.Option(
+            metavar="WxH,...", help="size of the film; of several, each scene takes the one nearest to its own shape"
+        ),
     ] = None,
     seed: options.Seed = 0,
     variant: options.Variant = terminal.DEFAULT_VARIANT,
@@ -54,7 +64,7 @@ def compare(
         int | None,
         typer.Option(
             metavar="N",
-            help="render references by path and keep them; default: the image beside a scene, or "
+            help="render references by path with N samples and keep them; default: the image beside a scene, or "
             f"{suite.DEFAULT_REFERENCE_SPP} samples",
         ),
     ] = None,
@@ -66,16 +76,16 @@ def compare(
         list[str] | None,
         typer.Option(
             metavar="NAME=FILE.exr,seconds=T[,...]",
-            help="an image that another renderer made in T seconds (its denoiser's not counted), repeatable; further: "
+            help="an image that another renderer made in T seconds (its denoiser not counted), repeatable; more: "
             "spp=N, denoised=true, scene=NAME",
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
     scheduler: options.Scheduler = None,
 ) -> None:
-    """Integrators at equal time: report.html, tables, results.json and .csv, images. Ctrl-C keeps what is done.
+    """Compare integrators at equal time: errors, curves and pictures.
 
-    The same command goes on from there.
+    The folder gets report.html, tables, results.json, results.csv and images. After Ctrl-C the same command goes on.
     """
     if output is None:
         raise InputError("compare needs a folder for its results: add -o DIR")

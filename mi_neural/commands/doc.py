@@ -14,9 +14,9 @@ from mi_neural.commands.options import readable
 
 @readable
 def doc(
-    page: Annotated[str | None, typer.Argument(metavar="[PAGE]", help="a plugin or a guide; none: the list")] = None,
+    page: Annotated[str | None, typer.Argument(metavar="[PAGE]", help="a plugin or a guide")] = None,
 ) -> None:
-    """The manual page of a plugin (`mi-neural doc nirc`) or a guide (`mi-neural doc choose`)."""
+    """Show the page of a plugin (`mi-neural doc nirc`) or a guide (`mi-neural doc choose`); without PAGE, list them."""
     from mi_neural.manual import pages
     from mi_neural.manual import terminal as shown
 

@@ -10,7 +10,7 @@ from mi_neural.commands import options
 
 @options.readable
 def info() -> None:
-    """Versions, variants, LLVM, cores."""
+    """Show versions, variants, LLVM, cores, plugins and scenes."""
     import mitsuba as mi
 
     import mi_neural
@@ -18,7 +18,10 @@ def info() -> None:
 
     facts = environment.describe()
     llvm = mi_neural.llvm.describe()
-    facts["variant"] = f"{terminal.DEFAULT_VARIANT} by default; plugins work under {', '.join(registration.SUPPORTED)}"
+    facts["variant"] = (
+        f"{terminal.DEFAULT_VARIANT} by default; all plugins work under {', '.join(registration.SUPPORTED)}, "
+        f"{', '.join(registration.WITHOUT_CACHE)} and light samplers under {', '.join(registration.OTHER_COLOURS)}, too"
+    )
     facts["llvm"] = llvm["version"] and f"{llvm['version']} from {llvm['source']}: {llvm['path']}"
     del facts["llvm_source"]
     if llvm["problem"]:

@@ -17,27 +17,31 @@ Scene = Annotated[
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="a key of the integrator; a.b=v reaches into a nested plugin"),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="a key of each integrator that has it; a.b=v sets key b of the nested plugin a",
+    ),
 ]
 Define = Annotated[
     list[str] | None, typer.Option("--define", "-D", metavar="NAME=VALUE", help="a $parameter of the scene")
 ]
 Size = Annotated[str | None, typer.Option(metavar="WxH", help="size of the film, in place of the scene's")]
-Seed = Annotated[int, typer.Option(min=0, help="same seed, same image")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of the random numbers; the same seed gives the same image")]
 Variant = Annotated[str, typer.Option(help="Mitsuba variant")]
 ReferenceFile = Annotated[
     str | None,
     typer.Option(
         "--reference",
         metavar="REF.exr",
-        help="measure errors against this image, which may be N times as large as the film, or an Nth",
+        help="measure errors against this image; its size may be N times that of the film, or an Nth",
     ),
 ]
-Denoise = Annotated[bool, typer.Option("--denoise", help="Open Image Denoise with albedo and normals as guides")]
+Denoise = Annotated[bool, typer.Option("--denoise", help="remove noise by Open Image Denoise, with albedo and normals")]
 
 Scheduler = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="a Dask scheduler, like tcp://HOST:8786, whose workers do it; default: none"),
+    typer.Option(metavar="ADDRESS", help="let the workers of this Dask scheduler do it, for example tcp://HOST:8786"),
 ]
 
 

@@ -17,7 +17,8 @@ from mi_neural.commands import options
 def plan(
     scene: options.Scene,
     integrator: Annotated[
-        str | None, typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="default: nirc")
+        str | None,
+        typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="an integrator and its keys; default: nirc"),
     ] = None,
     set_: options.Set = None,
     define: options.Define = None,
@@ -25,7 +26,7 @@ def plan(
     variant: options.Variant = terminal.DEFAULT_VARIANT,
     json_: Annotated[bool, typer.Option("--json", help="print it as JSON")] = False,
 ) -> None:
-    """What an integrator models in SCENE, what it leaves out, and why. Nothing is rendered."""
+    """Show what an integrator builds in SCENE, what it leaves out, and why. Nothing is rendered."""
     spec = load.parse_integrator(integrator or "nirc")
     wanted_size, keys, parameters = (
         terminal.parse_size(size),

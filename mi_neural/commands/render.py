@@ -23,17 +23,24 @@ def render(
     scene: options.Scene,
     integrator: Annotated[
         str | None,
-        typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="default: the scene's own, else path"),
+        typer.Option(
+            "-i",
+            "--integrator",
+            metavar="TYPE[:K=V,...]",
+            help="an integrator and its keys, for example nirc:cache_samples=8; default: the scene's own, else path",
+        ),
     ] = None,
     set_: options.Set = None,
     define: options.Define = None,
-    spp: Annotated[int | None, typer.Option(help="samples a pixel; default: what the scene says")] = None,
+    spp: Annotated[int | None, typer.Option(help="samples a pixel; default: those of the scene")] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="wall time instead of samples, with training, without compiling")
+        float | None, typer.Option(help="wall time in place of samples; training counts, compiling does not")
     ] = None,
     until_error: Annotated[
         float | None,
-        typer.Option(metavar="E", help="until the estimated trimmed relMSE (noise, not bias) is E; at most --seconds"),
+        typer.Option(
+            metavar="E", help="render until the estimated trimmed relMSE (noise, not bias) is E, at most --seconds"
+        ),
     ] = None,
     pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before the clock starts")] = 0,
     size: options.Size = None,
@@ -44,15 +51,19 @@ def render(
     ] = None,
     reference: options.ReferenceFile = None,
     denoise_: options.Denoise = False,
-    save_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="keep what was learned")] = None,
-    load_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="start from what was learned")] = None,
-    json_: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="write the facts")] = None,
+    save_cache: Annotated[Path | None, typer.Option(metavar="FILE", help="write the trained cache to FILE")] = None,
+    load_cache: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="start with a cache that --save-cache wrote")
+    ] = None,
+    json_: Annotated[
+        Path | None, typer.Option("--json", metavar="OUT.json", help="write times, samples, errors and settings")
+    ] = None,
     scheduler: options.Scheduler = None,
 ) -> None:
-    """Render SCENE to an EXR with metadata, or a PNG. Ctrl-C keeps the image so far, as is done every minute.
+    """Render SCENE to an EXR with metadata, or to a PNG.
 
-    With --scheduler the cache is trained here, and the workers render the samples.
-    Where a cache trains for long, a first image of one sample a pixel is written after a second of it.
+    The image so far is written every minute, and after Ctrl-C. If training takes long, a first image of one sample a
+    pixel is written after one second of it. With --scheduler the cache is trained here, and the workers render.
     """
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")

@@ -19,19 +19,21 @@ from mi_neural.reproduce.work import Work
 @options.readable
 def reproduce(
     name: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME", help="entries, or all of a source; default: list them")
+        list[str] | None, typer.Argument(metavar="NAME", help="entries, or the name of a source for all of its entries")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="small: each in less than two minutes on two cores")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="small sizes: each takes less than two minutes on two cores")
+    ] = False,
     size: options.Size = None,
     variant: options.Variant = terminal.DEFAULT_VARIANT,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="folder for all results; NAME is a folder in it")
     ] = Path("out/reproduce"),
 ) -> None:
-    """Counterparts of the figures and tables of the papers that this package implements: pictures, plots, and the
-    paper's numbers beside ours, on one HTML page each. Without a NAME they are listed.
+    """Render counterparts of the papers' figures and tables; without NAME, list them.
 
-    Ctrl-C keeps what is measured; the same command goes on from there. Delete DIR/measured to measure anew.
+    Each is one HTML page: pictures, plots, and the paper's numbers beside ours. After Ctrl-C the same command goes on.
+    Delete DIR/measured to measure anew.
     """
     if not name:
         _print_left(listing())

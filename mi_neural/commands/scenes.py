@@ -18,9 +18,9 @@ scenes = typer.Typer(name="scenes", invoke_without_command=True, rich_markup_mod
 @scenes.callback()
 @options.readable
 def list_(context: typer.Context) -> None:
-    """Scenes that every command takes by name: those of the package, and public ones.
+    """List the scenes that every command takes by name, and get public ones.
 
-    Public ones lie in the folder MI_NEURAL_SCENES, by default in the user's cache.
+    Public ones lie in the folder MI_NEURAL_SCENES, by default ~/.cache/mi_neural/scenes.
     """
     if context.invoked_subcommand:
         return
@@ -74,9 +74,9 @@ def get(
         bool, typer.Option("--accept", help="take an archive, or files, that differ from what is known")
     ] = False,
 ) -> None:
-    """Get public scenes into the folder MI_NEURAL_SCENES, by default the user's cache.
+    """Get public scenes into the folder MI_NEURAL_SCENES, by default ~/.cache/mi_neural/scenes.
 
-    Interrupted, the same command goes on from there.
+    After an interruption the same command goes on.
     """
     for one in name:
         fetch.entry(one)

@@ -29,14 +29,19 @@ def sequence(
     scene: options.Scene,
     integrator: Annotated[
         list[str] | None,
-        typer.Option("-i", "--integrator", metavar="TYPE[:K=V,...]", help="repeatable; default: path and nirc"),
+        typer.Option(
+            "-i",
+            "--integrator",
+            metavar="TYPE[:K=V,...]",
+            help="an integrator and its keys, for example nirc:blend=fast; repeatable; default: path and nirc",
+        ),
     ] = None,
     change: Annotated[list[str] | None, typer.Option(metavar="KEY=EXPR", help=CHANGE_HELP)] = None,
     frames: Annotated[int, typer.Option(metavar="N", help="number of frames")] = DEFAULT_FRAMES,
     change_at: Annotated[
-        int | None, typer.Option(metavar="T", help="frame of an abrupt change: `after` and `s` count from it")
+        int | None, typer.Option(metavar="T", help="frame of an abrupt change, from which `after` is 1")
     ] = None,
-    pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train that many frames before frame 0")] = 0,
+    pretrain: Annotated[int, typer.Option(metavar="FRAMES", help="train so many frames before frame 0")] = 0,
     set_: options.Set = None,
     define: options.Define = None,
     spp: Annotated[int, typer.Option(help="samples a pixel of a frame")] = 1,
@@ -47,20 +52,26 @@ def sequence(
         int | None,
         typer.Option(
             metavar="N",
-            help=f"samples of a reference, one per state of the scene; default {DEFAULT_REFERENCE_SPP}",
+            help=f"samples of a reference, one for each state of the scene; default {DEFAULT_REFERENCE_SPP}",
         ),
     ] = None,
-    no_reference: Annotated[bool, typer.Option("--no-reference", help="no references: SMAPE alone")] = False,
+    no_reference: Annotated[
+        bool, typer.Option("--no-reference", help="render no references: flicker (SMAPE) alone is measured")
+    ] = False,
     crop: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y,W,H", help="repeatable; default: most and least changed region")
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y,W,H", help="a region to show enlarged; repeatable; default: the most and the least changed one"
+        ),
     ] = None,
     denoise_: options.Denoise = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="folder for all results")] = None,
     scheduler: options.Scheduler = None,
 ) -> None:
-    """SCENE changing from frame to frame: frames, error and flicker over time, crops, an animated preview.
+    """Compare integrators on a scene that changes from frame to frame.
 
-    Ctrl-C keeps what is done; the same command goes on from there. With --scheduler the workers render the frames, with
+    The folder gets frames, error and flicker over time, crops and an animated preview. After Ctrl-C the same command
+    goes on. With --scheduler the workers render the frames, with
     caches that are trained here before the first one (train_steps=0); references are rendered here.
     """
     if output is None:
