@@ -12,6 +12,7 @@ from mi_neural.integrators.checks import (
     check_film,
     check_lights_in_media,
     check_phase_functions,
+    check_spp,
     refuse_medium_of,
     sensor_of,
 )
@@ -159,7 +160,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         sensor = self._sensor(scene, sensor)
         if not self.renders_media:
             refuse_medium_of(sensor, self.plugin)
-        self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
+        check_spp(spp, self.plugin)
         check_film(sensor, self.plugin, self.PIXEL_BYTES)
         return sensor
 

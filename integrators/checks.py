@@ -111,6 +111,12 @@ def _check_emitter(emitter, plugin: str) -> None:
                 )
 
 
+def check_spp(spp, plugin: str) -> None:
+    """Refuse samples a pixel that are no whole number from 0 on."""
+    if not hasattr(spp, "__index__") or spp < 0:
+        raise ValueError(f"{plugin}: spp is {spp!r}; give a whole number, 0 for the sampler's own count")
+
+
 def check_film(sensor, plugin: str, bytes_per_pixel: int = 4 * FILM_VALUES) -> None:
     """Refuse, before memory is asked for, a film that does not fit Dr.Jit's arrays or the memory that is free.
 

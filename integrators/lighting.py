@@ -15,7 +15,15 @@ from mi_neural.render.frozen import LOCK
 
 
 def light_sampler_of(props):
-    """The nested light sampler of a plugin's properties, None without one. Raises ValueError for anything else."""
+    """The nested light sampler of a plugin's properties, None without one. Raises ValueError for anything else, and for
+    one that has another name: Mitsuba would call it an unreferenced property."""
+    for key, value in props.props.objects(False):  # first: it marks all as not asked for
+        if key != "light_sampler" and hasattr(value, "lights"):
+            name = "" if key.startswith("_arg_") else f", not {key!r}"
+            raise ValueError(
+                f"{props.plugin_name()}: the name of a nested light sampler is light_sampler{name}; type "
+                f'<emitter type="{value.plugin}" name="light_sampler"/>'
+            )
     given = props.get("light_sampler", None)
     if given is not None and not hasattr(given, "lights"):
         raise ValueError(

@@ -9,7 +9,7 @@ from mi_neural.estimators import reservoir
 from mi_neural.estimators.reservoir import Reservoir
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import refuse_gradients
-from mi_neural.integrators.checks import check_film, check_scene, refuse_medium_of, sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, check_spp, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.integrators.restir_past import Past, alike, camera_of, nothing, reproject, slim_surface
@@ -18,7 +18,7 @@ from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import Area, camera_rays, coverage, recordable
-from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, is_recording, undisturbed
+from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, disturbed, is_recording, undisturbed
 from mi_neural.render.sampling import PathSampler
 
 COMBINATIONS = ("unbiased", "biased")
@@ -219,8 +219,13 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         """The mean of the next `spp` frames (0: as many as the sampler's sample count says)."""
         sensor = sensor_of(scene, sensor, "restir_di")
         refuse_medium_of(sensor, "restir_di")
-        self._check(spp >= 0, f"spp is {spp}; give 0 (the sampler's own count) or more")
+        check_spp(spp, "restir_di")
         check_film(sensor, "restir_di", PIXEL_BYTES)
+        if is_recording():
+            raise RuntimeError(
+                "restir_di: inside a function frozen by dr.freeze it would reuse the first call's samples for ever; "
+                "render it outside of that function, or use plain_path there"
+            )
         spp = spp or sensor.sampler().sample_count()
         seed = int(seed[0]) if hasattr(seed, "__len__") else int(seed)
         film = sensor.film()
@@ -254,7 +259,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             s.past = nothing(area.n_pixels)
             s.past_power, s.past_camera = s.power, camera
         s.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        records = s.freeze and not is_recording()
+        records = s.freeze
         facts = (facts, _facts(s.past_power.table), pinhole, area, s.alpha, records)
         numbers = mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, s.frame)
         rays = None
@@ -262,14 +267,20 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             pixel = dr.arange(mi.UInt32, area.n_pixels)
             rays = camera_rays(sensor, area, pixel, _numbers(pixel, *numbers, 0x6A09E667))[:3]
             dr.eval(rays)
+        frame = self._frame_of(area, pinhole)
         if facts not in s.frames:
-            frame = self._frame_of(area, pinhole)
             s.frames[facts] = dr.freeze(frame, auto_opaque=False) if records else frame
+        arguments = (scene, sensor if rays is None else None, rays, lights, s.power, s.past_power, s.past,
+                     s.past_camera, *numbers)  # fmt: skip
         with undisturbed():
-            pos, values, s.past = s.frames[facts](
-                scene, sensor if rays is None else None, rays, lights, s.power, s.past_power, s.past, s.past_camera,
-                *numbers,
-            )  # fmt: skip
+            try:
+                pos, values, s.past = s.frames[facts](*arguments)
+            except RuntimeError as e:
+                if not (records and disturbed(e)):
+                    raise
+                mi.Log(mi.LogLevel.Debug, f"restir_di: a frame could not be recorded: {e}")
+                del s.frames[facts]
+                pos, values, s.past = frame(*arguments)
         s.past_power, s.past_camera = s.power, camera
         s.frame += 1
         return pos, values

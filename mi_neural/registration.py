@@ -38,9 +38,9 @@ def variant_problem(variant: str | None = None) -> str | None:
     if variant is None:
         return f"no Mitsuba variant is set; {fix}"
     if variant.startswith("scalar"):
-        why = "scalar variants have no Dr.Jit compiler to train a cache with"
+        why = "scalar variants have no Dr.Jit arrays, with which it computes"
     elif "polarized" in variant:
-        why = "the caches do not track polarization"
+        why = "no integrator of it tracks polarization"
     elif variant in OTHER_COLOURS:
         why = f"the caches hold RGB radiance; {', '.join(WITHOUT_CACHE)} with any light sampler works in it"
     elif "spectral" in variant or "mono" in variant:

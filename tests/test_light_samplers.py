@@ -536,6 +536,16 @@ def test_what_is_no_light_sampler_is_refused(type_, given):
         mi.load_dict({"type": type_, "light_sampler": given})
 
 
+@pytest.mark.parametrize("type_", ["plain_path", "nirc", "restir_di"])
+@pytest.mark.parametrize("name, said", [("", ""), (' name="lights"', ", not 'lights'")])
+def test_a_light_sampler_by_another_name_is_refused_with_what_to_type(type_, name, said):
+    text = f'<integrator version="3.0.0" type="{type_}"><emitter type="tree_lights"{name}/></integrator>'
+    with pytest.raises((ValueError, RuntimeError)) as e:
+        mi.load_string(text)
+    assert (f"{type_}: the name of a nested light sampler is light_sampler{said}; type "
+            '<emitter type="tree_lights" name="light_sampler"/>') in str(e.value)  # fmt: skip
+
+
 def test_too_few_outputs_for_the_lights_are_refused_by_render():
     scene = shadow_scene()
     integrator = path_with({"type": "nvc_lights", "outputs": 2, "train_frames": 1})

@@ -105,9 +105,10 @@ def test_first_pass_is_the_whole_image_where_it_fits(scene):
 
 
 @pytest.mark.parametrize("name", ["plain_path", "nirc"])
-def test_negative_sample_counts_are_refused(name, scene):
-    with pytest.raises(ValueError, match=f"{name}: spp is -1"):
-        mi.load_dict(ALL[name]).render(scene, spp=-1)
+def test_impossible_sample_counts_are_refused(name, scene):
+    for spp in (-1, 1.5):
+        with pytest.raises(ValueError, match=f"{name}: spp is {spp}; give a whole number"):
+            mi.load_dict(ALL[name]).render(scene, spp=spp)
 
 
 # ---------------------------------------------------------------- several at once

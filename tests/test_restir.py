@@ -285,6 +285,28 @@ def test_frames_are_recorded_once():
     assert frame.n_recordings <= 3
 
 
+@pytest.mark.parametrize("flag", [dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops], ids=lambda flag: flag.name)
+def test_frames_that_cannot_be_recorded_are_rendered_as_they_are(flag):
+    """A user who looks for a fault switches symbolic calls or loops off."""
+    scene = diffuse_scene(8)
+    recorded = np.array(mi.render(scene, integrator=integrator(), spp=2, seed=3))
+    with dr.scoped_set_flag(flag, False):
+        plain = np.array(mi.render(scene, integrator=integrator(), spp=2, seed=3))
+    np.testing.assert_allclose(plain, recorded, rtol=1e-3, atol=1e-5)
+
+
+def test_function_of_the_users_own_that_is_frozen_says_why_not():
+    scene, it = diffuse_scene(8), integrator()
+    frame = dr.freeze(lambda scene, it, seed: mi.render(scene, integrator=it, spp=1, seed=seed))
+    with pytest.raises(Exception) as e:
+        frame(scene, it, mi.UInt32(0))
+    cause = e.value
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    assert "restir_di: inside a function frozen by dr.freeze" in str(cause) and "plain_path" in str(cause)
+    assert np.isfinite(np.array(mi.render(scene, integrator=it, spp=1))).all()  # nothing is broken by it
+
+
 @pytest.mark.parametrize("keys", [{"combination": "biased"}, {"light_sampler": NVC}], ids=["light", "nvc"])
 def test_lights_that_are_off_give_black(keys):
     scene, it = many_lights(8, black=True), integrator(**keys)
