@@ -5,20 +5,19 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.caches import presets
-from mi_neural.estimators import reservoir
-from mi_neural.estimators.reservoir import Reservoir
+from mi_neural.integrators import restir_reuse as reuse
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import refuse_gradients
 from mi_neural.integrators.checks import check_film, check_scene, check_spp, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
-from mi_neural.integrators.restir_past import Past, alike, camera_of, nothing, reproject, slim_surface
+from mi_neural.integrators.restir_past import Past, camera_of, nothing, reproject, slim_surface
 from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import Area, camera_rays, coverage, recordable
-from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_scene, disturbed, is_recording, undisturbed
+from mi_neural.render.frozen import LOCK, call, can_freeze, can_freeze_scene, is_recording
 from mi_neural.render.sampling import PathSampler
 
 COMBINATIONS = ("unbiased", "biased")
@@ -259,28 +258,20 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             s.past = nothing(area.n_pixels)
             s.past_power, s.past_camera = s.power, camera
         s.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        records = s.freeze
-        facts = (facts, _facts(s.past_power.table), pinhole, area, s.alpha, records)
+        facts = (facts, _facts(s.past_power.table), pinhole, area, s.alpha)
         numbers = mi.UInt32(seed & 0xFFFFFFFF), dr.opaque(mi.UInt32, s.frame)
         rays = None
-        if records and not can_freeze(sensor):
+        if s.freeze and not can_freeze(sensor):
             pixel = dr.arange(mi.UInt32, area.n_pixels)
             rays = camera_rays(sensor, area, pixel, _numbers(pixel, *numbers, 0x6A09E667))[:3]
             dr.eval(rays)
         frame = self._frame_of(area, pinhole)
-        if facts not in s.frames:
-            s.frames[facts] = dr.freeze(frame, auto_opaque=False) if records else frame
-        arguments = (scene, sensor if rays is None else None, rays, lights, s.power, s.past_power, s.past,
-                     s.past_camera, *numbers)  # fmt: skip
-        with undisturbed():
-            try:
-                pos, values, s.past = s.frames[facts](*arguments)
-            except RuntimeError as e:
-                if not (records and disturbed(e)):
-                    raise
-                mi.Log(mi.LogLevel.Debug, f"restir_di: a frame could not be recorded: {e}")
-                del s.frames[facts]
-                pos, values, s.past = frame(*arguments)
+        if s.freeze and facts not in s.frames:
+            s.frames[facts] = dr.freeze(frame, auto_opaque=False)
+        pos, values, s.past = call(
+            s.frames, facts, frame, scene, sensor if rays is None else None, rays, lights, s.power, s.past_power,
+            s.past, s.past_camera, *numbers,
+        )  # fmt: skip
         s.past_power, s.past_camera = s.power, camera
         s.frame += 1
         return pos, values
@@ -332,12 +323,12 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
 
             # --------------------- Reuse over frames ----------------------
             if self.history > 0:
-                kept = self.reuse_frame(scene, power, past_power, si, kept, past, before, found, sampler)
+                kept = reuse.frames(self, scene, power, past_power, si, kept, past, before, found, sampler)
             dr.eval(kept, si, usable, L, valid, w_camera, pos, sampler)
 
             # --------------------- Reuse over pixels ----------------------
             if self.spatial_samples > 0:
-                kept = self.reuse_pixels(scene, power, si, kept, usable, pixel, width, height, sampler)
+                kept = reuse.pixels(self, scene, power, si, kept, usable, pixel, width, height, sampler)
 
             # -------------------------- Shade -----------------------------
             f, p_light = samples.contribution(self, scene, power, si, kept.index, kept.uv, usable & (kept.W > 0))
@@ -378,51 +369,6 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         share = dr.select(delta, 1, 1 - samples.light_share(self, power, hit, pdf_light, found.bs.pdf, emits))
         Le = found.si.emitter(scene, emits).eval(found.si, emits)
         return mi.Color3f(0), dr.select(emits, Le * share, 0), sampler
-
-    def reuse_frame(self, scene, power, past_power, si, kept, past, before, found, sampler) -> Reservoir:
-        """Combine with what the pixel `before` kept in the last frame."""
-        old = reservoir.clamp_history(past.kept.at(before, found), self.history)
-        target = samples.target(self, scene, power, si, old.index, old.uv, found & (old.W > 0))
-        us = [sampler.next_1d(), sampler.next_1d()]
-        if not self.unbiased:
-            return reservoir.combine([kept, old], [kept.target, target], us)
-        si_old = dr.gather(mi.SurfaceInteraction3f, past.surface, before, found)
-        swapped = samples.target(self, scene, past_power, si_old, kept.index, kept.uv, found & (kept.W > 0))
-        shares = [reservoir.balance(kept.M, kept.target, old.M, swapped),
-                  reservoir.balance(old.M, old.target, kept.M, target)]  # fmt: skip
-        return reservoir.combine([kept, old], [kept.target, target], us, shares)
-
-    def reuse_pixels(self, scene, power, si, kept, usable, pixel, width, height, sampler) -> Reservoir:
-        """Combine with what pixels nearby kept, by defensive pairwise weights (biased: by 1/M)."""
-        n = self.spatial_samples
-
-        radius = self.spatial_radius if self.spatial_radius > 0 else min(max(height / 24, 4.0), 32.0)
-
-        def neighbour(i, total, own_share, sampler):
-            offset = mi.warp.square_to_uniform_disk(sampler.next_2d()) * radius
-            x = mi.Int32(pixel % width) + mi.Int32(dr.round(offset.x))
-            y = mi.Int32(pixel // width) + mi.Int32(dr.round(offset.y))
-            near = usable & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-            lane = mi.UInt32(dr.select(near, x + y * width, 0))
-            near &= (lane != pixel) & dr.gather(mi.Bool, usable, lane, near)
-            si_near = dr.gather(mi.SurfaceInteraction3f, si, lane, near)
-            near &= alike(self, si, si.t, si_near, si_near.t)
-            other = kept.at(lane, near)
-
-            target = samples.target(self, scene, power, si, other.index, other.uv, near & (other.W > 0))
-            share = other.M
-            if self.unbiased:
-                swapped = samples.target(self, scene, power, si_near, kept.index, kept.uv, near & (kept.W > 0))
-                share, _ = reservoir.pairwise(other.M, other.target, kept.M, target, n)
-                own_share += reservoir.pairwise(other.M, swapped, kept.M, kept.target, n)[1]
-            total = reservoir.merge(total, other, target, share, sampler.next_1d())
-            return i + 1, total, own_share, sampler
-
-        _, total, own_share, sampler = dr.while_loop(
-            (mi.UInt32(0), Reservoir.empty(dr.width(pixel)), mi.Float(kept.M), sampler),
-            lambda i, *_: usable & (i < n), neighbour, label="neighbours",
-        )  # fmt: skip
-        return reservoir.finish(reservoir.merge(total, kept, kept.target, own_share, sampler.next_1d()))
 
     # -------------------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render.frozen import can_freeze, disturbed, undisturbed
+from ..render.frozen import call, can_freeze
 from .schedule import pace
 from .voxels import Ages
 
@@ -143,16 +143,8 @@ class Trainer:
 
     def call(self, name: str, sensor, *args):
         """Call :meth:`recorded`; the method as it is where it cannot be recorded now."""
-        function = self.recorded(name, sensor)
-        with undisturbed():
-            try:
-                return function(*args)
-            except RuntimeError as e:
-                if function is not self._recorded.get(name) or not disturbed(e):
-                    raise
-                mi.Log(mi.LogLevel.Debug, f"mi_neural: {self.NAME} could not be recorded: {e}")
-                del self._recorded[name]
-                return getattr(self, name)(*args)
+        plain = getattr(self, name)
+        return call({} if self.recorded(name, sensor) == plain else self._recorded, name, plain, *args)
 
     def recordings(self) -> dict[str, int]:
         """How often each function was recorded."""

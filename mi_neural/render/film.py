@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .frozen import can_freeze, disturbed, is_special, undisturbed
+from .frozen import call, can_freeze, is_special
 from .sampling import PathSampler
 from .spectrum import film_colour
 
@@ -228,20 +228,10 @@ class Passes:
         key = (kind_of(sensor) if direct else "", area.width, area.size, area.border, area.box, alpha, sizes,
                tuple(channels), keys, record)  # fmt: skip
         plain = _pass_of(estimate, dict(channels), area, alpha, n_pixels, n_lanes, special)
-        if special is None and key not in self.recorded:
-            self.recorded[key] = dr.freeze(plain, auto_opaque=False) if record else plain
         arguments = scene, sensor if rays is None else None, rays, lights, field, samples, offset, settings
-        with undisturbed():
-            if special is not None:
-                return plain(*arguments)
-            try:
-                return self.recorded[key](*arguments)
-            except RuntimeError as e:
-                if not (record and disturbed(e)):
-                    raise
-                mi.Log(mi.LogLevel.Debug, f"mi_neural: a pass could not be recorded: {e}")
-                del self.recorded[key]
-                return plain(*arguments)
+        if record and key not in self.recorded:
+            self.recorded[key] = dr.freeze(plain, auto_opaque=False)
+        return call(self.recorded, key, plain, *arguments)
 
 
 def kind_of(sensor) -> tuple:

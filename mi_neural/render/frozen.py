@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import signal
 import threading
+from collections.abc import Callable
 from contextlib import contextmanager
 
 import drjit as dr
@@ -90,6 +91,21 @@ def disturbed(error: RuntimeError) -> bool:
     """Whether a recording failed because another thread made or freed something of Mitsuba's meanwhile: then the
     function can be called as it is."""
     return "record" in str(error) and not is_recording()
+
+
+def call(recorded: dict, key, plain: Callable, *args):
+    """Call ``recorded[key]``, the frozen form of `plain`; `plain` where there is none or it cannot be recorded now."""
+    with undisturbed():
+        if key not in recorded:
+            return plain(*args)
+        try:
+            return recorded[key](*args)
+        except RuntimeError as e:
+            if not disturbed(e):
+                raise
+            mi.Log(mi.LogLevel.Debug, f"mi_neural: {key} could not be recorded: {e}")
+            del recorded[key]
+            return plain(*args)
 
 
 def is_recording() -> bool:
