@@ -20,10 +20,12 @@ from mi_neural.manual import directives, pages
 ROOT = Path(__file__).resolve().parents[1]
 #: Modules whose names have entries: the interface that the guides speak of. `mi_neural` itself comes before them.
 MODULES = ("mi_neural.explore.session", "mi_neural.explore.views", "mi_neural.caches.field",
-           "mi_neural.caches.incident", "mi_neural.caches.outgoing", "mi_neural.caches.visibility",
-           "mi_neural.caches.radiance_cache", "mi_neural.lights.sampling", "mi_neural.lights.table",
+           "mi_neural.caches.weights", "mi_neural.caches.incident", "mi_neural.caches.outgoing",
+           "mi_neural.caches.outgoing_field", "mi_neural.caches.visibility", "mi_neural.caches.radiance_cache",
+           "mi_neural.lights.sampling", "mi_neural.lights.table",
            "mi_neural.estimators.two_level", "mi_neural.estimators.reservoir", "mi_neural.image.denoise",
            "mi_neural.image.metrics", "mi_neural.image.exr", "mi_neural.bench.changes", "mi_neural.bench.cluster",
+           "mi_neural.bench.workers",
            "mi_neural.scenes")  # fmt: skip
 #: Pictures of `scenes` that pages of `docs` show.
 PICTURES = ("ajar_door.png", "gallery.webp", "moving_light.webp")

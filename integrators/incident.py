@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from mi_neural.caches import presets
 from mi_neural.caches.encoding import SURFACE
-from mi_neural.caches.field import FieldShape
 from mi_neural.caches.incident import LOSSES, Training
+from mi_neural.caches.weights import FieldShape
 from mi_neural.integrators.common import CacheIntegrator
 
 #: Rows of these keys, for the docstrings

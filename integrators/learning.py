@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from mi_neural import plan
 from mi_neural.caches.blend import BLENDS
-from mi_neural.caches.field import FieldShape
 from mi_neural.caches.incident import IncidentCache, Training
 from mi_neural.caches.reliability import MEASURES, Reliability
+from mi_neural.caches.weights import FieldShape
 from mi_neural.integrators import planning
 from mi_neural.integrators.base import FilmIntegrator
 
@@ -98,7 +98,7 @@ class LearningIntegrator(FilmIntegrator):
         return {}
 
     def shape_keys(self, props) -> dict:
-        """Sizes of :class:`~mi_neural.caches.field.FieldShape` that keys of the plugin's own set."""
+        """Sizes of :class:`~mi_neural.caches.weights.FieldShape` that keys of the plugin's own set."""
         return {}
 
     def default_epsilon(self) -> float:

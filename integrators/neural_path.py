@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mi_neural.caches.accuracy import MeasuredCache
 from mi_neural.caches.blend import where_active
-from mi_neural.caches.outgoing import OutgoingShape
+from mi_neural.caches.outgoing_field import OutgoingShape
 from mi_neural.estimators.spread import grown
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator

@@ -5,7 +5,8 @@ import mitsuba as mi
 
 from mi_neural.caches import presets
 from mi_neural.caches.blend import OutgoingBlend, sigma_channels
-from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape
+from mi_neural.caches.outgoing import OutgoingCache
+from mi_neural.caches.outgoing_field import OutgoingShape
 from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix

@@ -8,6 +8,7 @@ from functools import partial
 import mitsuba as mi
 
 from mi_neural import plan
+from mi_neural.light_noise import light_noise
 from mi_neural.lights.entries import is_emissive_mesh
 from mi_neural.lights.inexact import inexact
 from mi_neural.lights.table import ends_the_process
@@ -24,7 +25,7 @@ def make_plan(integrator, scene, sensor) -> plan.ScenePlan:
     request = plan.Request(
         integrator.plugin, integrator.plan_mode, integrator.given, integrator.caches, integrator.max_depth,
         integrator.cache.blend, {key: getattr(default, name) for key, name in SIZES.items() if hasattr(default, name)},
-        partial(plan.light_noise, scene, sensor) if integrator.CHOOSES_LIGHTS else None,
+        partial(light_noise, scene, sensor) if integrator.CHOOSES_LIGHTS else None,
     )  # fmt: skip
     made = plan.of_integrator(facts, request)
     if integrator.nested_sampler is None and ends_the_process(scene):

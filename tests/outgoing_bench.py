@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_neural.caches.outgoing import OutgoingField, OutgoingShape
+from mi_neural.caches.outgoing_field import OutgoingField, OutgoingShape
 from mi_neural.caches.radiance_cache import CacheInput, DispatchFlags, RadianceCache
 
 TINY = OutgoingShape(

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_neural.caches.field import FieldShape, Weights
+from mi_neural.caches.weights import FieldShape, Weights
 
 # Widths that are no multiple of anything, a part of the inputs known before, leaking rectifiers, one hidden layer
 SHAPES = {

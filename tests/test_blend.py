@@ -7,10 +7,11 @@ import pytest
 from test_incident import load, same
 
 from mi_neural.caches.blend import BLENDS, Blend, OutgoingBlend
-from mi_neural.caches.field import Field, FieldShape
+from mi_neural.caches.field import Field
 from mi_neural.caches.incident import IncidentCache, Training
-from mi_neural.caches.outgoing import OutgoingField, OutgoingShape
+from mi_neural.caches.outgoing_field import OutgoingField, OutgoingShape
 from mi_neural.caches.reliability import MEASURES, Reliability
+from mi_neural.caches.weights import FieldShape
 
 SHAPE = FieldShape(n_levels=4, hashmap_size=2**10, width=16, n_hidden=1)
 N = 600

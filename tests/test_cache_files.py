@@ -13,11 +13,12 @@ import pytest
 from test_incident import load
 
 from mi_neural.caches import files
-from mi_neural.caches.field import FieldShape
 from mi_neural.caches.files import CacheFileError
 from mi_neural.caches.incident import IncidentCache, Training
-from mi_neural.caches.outgoing import OutgoingCache, OutgoingShape, OutgoingTraining
+from mi_neural.caches.outgoing import OutgoingCache, OutgoingTraining
+from mi_neural.caches.outgoing_field import OutgoingShape
 from mi_neural.caches.reliability import Reliability
+from mi_neural.caches.weights import FieldShape
 
 TINY = {"n_levels": 4, "hashmap_size": 2**10, "width": 16}
 #: The same, as keys of integrators.

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from mi_neural.bench import benchmark, budget, changes, cluster, jobs, load, sequence
 from mi_neural.bench.load import InputError
+from mi_neural.bench.workers import ClusterError, Workers, connect
 from mi_neural.cli import app
 from mi_neural.image import exr
 from mi_neural.image.moments import Moments
@@ -274,7 +275,7 @@ def test_frames_of_two_workers_are_those_of_one_process(address, tmp_path, integ
         loaded = load.load_scene("cornell_box", SIZE, merge=False)
         case = benchmark.make_cases(loaded, [load.parse_integrator(integrator)])[0]
         over_time = sequence.Sequence(loaded.scene, changes.parse(texts, 4, None), 4)
-        with cluster.connect(client) as workers:
+        with connect(client) as workers:
             elsewhere = workers and cluster.frames_of(workers, loaded, SIZE, texts, over_time, plan)
             [result] = sequence.Run(loaded, over_time, plan, folder, elsewhere=elsewhere).run([case])
         return [result.image(k).rgb for k in range(4)]
@@ -314,7 +315,7 @@ class Homeless:
 
 
 def first_error(address: str, job) -> str:
-    with cluster.connect(address) as workers, pytest.raises(cluster.ClusterError) as error:
+    with connect(address) as workers, pytest.raises(ClusterError) as error:
         next(workers.run([(job, None)]))
     assert "\n" not in str(error.value)
     return str(error.value)
@@ -350,14 +351,14 @@ def test_process_that_would_give_another_result_refuses(kind):
     ],
 )
 def test_what_cannot_be_rendered_in_parts_is_refused(integrator, over_time, message):
-    with pytest.raises(cluster.ClusterError, match=message):
+    with pytest.raises(ClusterError, match=message):
         cluster.check(setup_of(integrator)[2], over_time)
 
 
 @pytest.mark.parametrize("wrong", ["tcp://127.0.0.1:1", "nonsense", "no://127.0.0.1:1"])
 def test_address_where_no_scheduler_answers(wrong, monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(cluster.ClusterError, match=r"no Dask scheduler answers at .*: type `dask scheduler`"):
+    monkeypatch.setattr("mi_neural.bench.workers.CONNECT_SECONDS", 0.5)
+    with pytest.raises(ClusterError, match=r"no Dask scheduler answers at .*: type `dask scheduler`"):
         render(client=wrong)
 
 
@@ -376,9 +377,9 @@ def test_no_worker_for_a_while():
         def nthreads(self):
             return {}
 
-    workers = cluster.Workers(Nobody(), patience=0.1)
+    workers = Workers(Nobody(), patience=0.1)
     for wait in (workers.count, lambda: next(workers.map([(None, None)]))):
-        with pytest.raises(cluster.ClusterError, match=r"no worker at tcp://HOST:8786 for 0.1 s: start one with"):
+        with pytest.raises(ClusterError, match=r"no worker at tcp://HOST:8786 for 0.1 s: start one with"):
             wait()
 
 
@@ -405,7 +406,7 @@ def test_answer_of_a_worker_that_died_is_not_waited_for(alive):
             return {"tcp://HOST:1": 1} if alive else {"tcp://HOST:2": 1}
 
     future = Slow()
-    found = cluster.Workers(OneWorker())._fetch(future, "tcp://HOST:1")
+    found = Workers(OneWorker())._fetch(future, "tcp://HOST:1")
     assert (found, future.calls) == (("answer", 3) if alive else (None, 1))
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from mi_neural.caches import encoding, loss
-from mi_neural.caches.field import FILE_VERSION, CacheFileError, Field, FieldShape
+from mi_neural.caches.field import FILE_VERSION, CacheFileError, Field
+from mi_neural.caches.weights import FieldShape
 
 TINY = FieldShape(n_levels=2, hashmap_size=128, base_resolution=3, direction_degree=1, width=8, n_hidden=1)
 SHAPES = {

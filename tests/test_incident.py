@@ -15,10 +15,11 @@ from expectation import assert_mean
 
 from mi_neural import scenes
 from mi_neural.caches import incident
-from mi_neural.caches.field import Field, FieldShape, Weights
+from mi_neural.caches.field import Field
 from mi_neural.caches.incident import IncidentCache, Training, reflect, trace_records
 from mi_neural.caches.records import TrainingRecords
 from mi_neural.caches.training_paths import Suffixes, trace_training_paths
+from mi_neural.caches.weights import FieldShape, Weights
 from mi_neural.render import vertex
 from mi_neural.render.sampling import PathSampler
 

@@ -11,9 +11,10 @@ from expectation import assert_mean, assert_same_mean, renders
 from light_scenes import at, glow, picture, place, uniforms
 
 from mi_neural.integrators import planning
+from mi_neural.light_noise import LightNoise
 from mi_neural.lights.inexact import inexact
 from mi_neural.lights.table import LightTable
-from mi_neural.plan import LightNoise, Request, SceneFacts, of_integrator, of_sampler
+from mi_neural.plan import Request, SceneFacts, of_integrator, of_sampler
 from mi_neural.render import vertex
 
 BLACK = {"type": "diffuse", "reflectance": 0.0}

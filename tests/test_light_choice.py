@@ -21,11 +21,13 @@ from light_scenes import (
 )
 from scipy import stats
 
-from mi_neural import plan
 from mi_neural.caches import visibility
+from mi_neural.light_noise import light_noise
 from mi_neural.lights.clusters import Groups, kmeans, make_groups
+from mi_neural.lights.entries import DIRECTION, ENVIRONMENT, LOCAL
+from mi_neural.lights.importance import importance
 from mi_neural.lights.sampling import PowerLights, TreeLights, UniformLights, VisibleLights
-from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, LightTable, importance
+from mi_neural.lights.table import LightTable
 
 
 @pytest.fixture(scope="module")
@@ -530,8 +532,8 @@ def test_no_number_is_used_twice_where_lights_are_looked_at(mixed, counted, monk
     scene, table = mixed
     camera = mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, -6, 3], [0, 0, 0],
                                                                                             [0, 0, 1])})  # fmt: skip
-    monkeypatch.setattr(plan, "PathSampler", counted)
-    assert np.isfinite(plan.light_noise(scene, camera, n_points=64).uniform)
+    monkeypatch.setattr("mi_neural.light_noise.PathSampler", counted)
+    assert np.isfinite(light_noise(scene, camera, n_points=64).uniform)
     assert len(counted.uses) == 2 and counted.most_uses() == 1
 
     monkeypatch.setattr(visibility, "PathSampler", counted)

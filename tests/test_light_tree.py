@@ -24,8 +24,9 @@ from test_light_choice import assert_frequencies, draws, pmf_of_all, received
 from test_vertex import lights, test_scene
 
 from mi_neural.lights import tree
+from mi_neural.lights.entries import DIRECTION, ENVIRONMENT, LOCAL
 from mi_neural.lights.sampling import TreeLights
-from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, LightTable
+from mi_neural.lights.table import LightTable
 
 
 def columns_of(centers, radius=0.01, axis=(0, 0, 1), cone=1.0, intensity=1.0, kind=LOCAL, form=1, plain=True) -> dict:

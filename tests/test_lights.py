@@ -24,9 +24,20 @@ from light_scenes import (
 
 from mi_neural.lights import table as table_module
 from mi_neural.lights.clusters import make_groups
-from mi_neural.lights.entries import CYLINDER, DISK, OTHER, PARALLELOGRAM, POINT, SPHERE, TRIANGLE
+from mi_neural.lights.entries import (
+    CYLINDER,
+    DIRECTION,
+    DISK,
+    ENVIRONMENT,
+    LOCAL,
+    OTHER,
+    PARALLELOGRAM,
+    POINT,
+    SPHERE,
+    TRIANGLE,
+)
 from mi_neural.lights.sampling import PowerLights, TreeLights, UniformLights, VisibleLights
-from mi_neural.lights.table import DIRECTION, ENVIRONMENT, LOCAL, SHADOW_EPSILON, LightTable
+from mi_neural.lights.table import SHADOW_EPSILON, LightTable
 from mi_neural.render import vertex
 
 FLAT = (TRIANGLE, PARALLELOGRAM)

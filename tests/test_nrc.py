@@ -19,7 +19,8 @@ from test_vertex import lights, test_scene
 from mi_neural import scenes
 from mi_neural.caches import training_paths
 from mi_neural.caches.field import CacheFileError, Field
-from mi_neural.caches.outgoing import OutgoingField, OutgoingShape, OutgoingTraining, Places, trace_outgoing
+from mi_neural.caches.outgoing import OutgoingTraining, Places, trace_outgoing
+from mi_neural.caches.outgoing_field import OutgoingField, OutgoingShape
 from mi_neural.caches.records import empty_surfaces, packed
 from mi_neural.estimators.spread import PathSpread, camera_spread
 from mi_neural.render.sampling import PathSampler

@@ -10,7 +10,7 @@ from outgoing_bench import close, jit, learn, make, same, surfaces, truth
 
 from mi_neural.caches import encoding
 from mi_neural.caches.optimizer import own_copy
-from mi_neural.caches.outgoing import ALBEDO_MIN, OutgoingShape
+from mi_neural.caches.outgoing_field import ALBEDO_MIN, OutgoingShape
 from mi_neural.render.frozen import undisturbed
 from mi_neural.render.kernels import on_gpu
 

@@ -15,7 +15,8 @@ from test_incident import load
 from mi_neural import plan, scenes
 from mi_neural.caches.blend import Blend
 from mi_neural.caches.field import CacheFileError
-from mi_neural.plan import LightNoise, Request, SceneFacts
+from mi_neural.light_noise import LightNoise, light_noise
+from mi_neural.plan import Request, SceneFacts
 
 INCIDENT, OUTGOING = ("incident",), ("outgoing",)
 #: A cache that is trained in a second.
@@ -164,7 +165,7 @@ def test_noise_of_a_choice_is_known_where_one_light_is_seen(n_hidden, environmen
     """All but one of n lights give nothing: a uniform choice has the relative variance n - 1, as far as points are not
     much darker than most (the fixed seed's points: within 5 %). By visibility less than the floor's share of it."""
     scene = boxes(n_hidden, environment)
-    noise = plan.light_noise(scene, scene.sensors()[0], n_points=512)
+    noise = light_noise(scene, scene.sensors()[0], n_points=512)
     n = n_hidden + 1 + environment
     assert noise.uniform == pytest.approx(n - 1, rel=0.05)
     if not environment:  # lamps alike, so the same by power; a bright sky behind the walls is another matter
@@ -178,7 +179,7 @@ def test_forty_suns_are_looked_at_though_the_network_cannot_have_them():
     scene = scene_of(suns)
     camera = mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, -4, 4], [0, 0, 0],
                                                                                             [0, 0, 1])})  # fmt: skip
-    noise = plan.light_noise(scene, camera, n_points=64)
+    noise = light_noise(scene, camera, n_points=64)
     assert np.isinf(noise.visibility) and noise.uniform < 0.5
     assert not planned(facts(40), look=lambda: noise).modelled("light_sampler")
 

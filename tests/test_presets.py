@@ -14,12 +14,14 @@ from test_vertex import test_scene as lit
 from mi_neural import scenes
 from mi_neural.caches import loss, radiance_cache, visibility
 from mi_neural.caches.direct import DirectTraining, HeField, air_records
-from mi_neural.caches.field import CacheFileError, Field, FieldShape
+from mi_neural.caches.field import CacheFileError, Field
 from mi_neural.caches.incident import Training, trace_records
 from mi_neural.caches.material import material_of
-from mi_neural.caches.outgoing import OutgoingShape, OutgoingTraining
+from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.outgoing_field import OutgoingShape
 from mi_neural.caches.radiance_cache import DispatchFlags, RadianceCache
 from mi_neural.caches.reliability import Reliability
+from mi_neural.caches.weights import FieldShape
 
 #: Smaller than printed, for time alone.
 QUICK = {"train_samples": 256, "train_steps": 1}

@@ -32,9 +32,10 @@ from outgoing_bench import (
     weights,
 )
 
-from mi_neural.caches.field import CacheFileError, Field, FieldShape
-from mi_neural.caches.outgoing import OutgoingField
+from mi_neural.caches.field import CacheFileError, Field
+from mi_neural.caches.outgoing_field import OutgoingField
 from mi_neural.caches.radiance_cache import CacheInput, DispatchFlags, RadianceCache, self_training_frame
+from mi_neural.caches.weights import FieldShape
 
 # ---------------------------------------------------------------- the cache: interface
 

@@ -9,8 +9,10 @@ from scipy import stats
 
 from mi_neural.lights import sky
 from mi_neural.lights.clusters import make_groups
+from mi_neural.lights.entries import DIRECTION
+from mi_neural.lights.importance import importance
 from mi_neural.lights.sampling import VisibleLights
-from mi_neural.lights.table import DIRECTION, LightTable, importance
+from mi_neural.lights.table import LightTable
 
 
 def directions(n, seed=0):

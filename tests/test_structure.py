@@ -24,6 +24,7 @@ LAYERS = [
     {"llvm", "scenes", "estimators", "image", "parameters"},
     {"render"},
     {"caches", "lights"},
+    {"light_noise"},
     {"plan"},
     {"emitters"},  # light samplers do not know integrators
     {"integrators"},
@@ -38,7 +39,7 @@ LAYERS = [
 STARTUP = {"", "registration"}
 
 # What must stay a function of samples or of features, whatever the scene
-BLIND = ["caches/field.py", "caches/encoding.py", "caches/loss.py", "estimators/two_level.py",
+BLIND = ["caches/field.py", "caches/weights.py", "caches/encoding.py", "caches/loss.py", "estimators/two_level.py",
          "estimators/reservoir.py", "image/exr.py", "image/metrics.py", "image/moments.py",
          "image/denoise.py"]  # fmt: skip
 

@@ -11,8 +11,8 @@ from light_scenes import glow
 from test_light_samplers import SAMPLERS, path_with
 
 from mi_neural.caches import visibility
-from mi_neural.caches.field import FieldShape
 from mi_neural.caches.visibility import VisibilityCache, VisibilityField, VisibilityTraining, surface_point
+from mi_neural.caches.weights import FieldShape
 from mi_neural.lights.clusters import make_groups
 from mi_neural.lights.table import LightTable
 

@@ -13,7 +13,6 @@ from mi_neural.image import exr
 
 from . import (
     benchmark,
-    cluster,
     collection,
     denoise,
     elsewhere,
@@ -28,6 +27,7 @@ from . import (
 )
 from . import reference as references
 from .load import InputError
+from .workers import ClusterError, JobError, Workers
 
 #: Samples a pixel of references that are rendered, where nothing else is asked for.
 DEFAULT_REFERENCE_SPP = 1024
@@ -87,7 +87,7 @@ class Suite:
 
     def __init__(
         self, files: list[Path], settings: Settings, folder: Path, bars: Callable,
-        workers: cluster.Workers | None = None,
+        workers: Workers | None = None,
     ) -> None:  # fmt: skip
         self.workers, self.problem = workers, ""
         self._later: list[_Later] = []
@@ -121,8 +121,8 @@ class Suite:
             self._by_workers()
         except KeyboardInterrupt:
             self.interrupted = True
-        except cluster.ClusterError as error:
-            if len(self.files) == 1 and isinstance(error, cluster.JobError):
+        except ClusterError as error:
+            if len(self.files) == 1 and isinstance(error, JobError):
                 raise
             self.interrupted, self.problem = True, str(error)
         finally:
@@ -137,7 +137,7 @@ class Suite:
         bar = self.bars(f"{terminal.counted(todo, 'case')} on {workers}")
         for done, (index, answer) in enumerate(self.workers.map([(case.job, case.shared) for case in self._later])):
             case = self._later[index]
-            if isinstance(answer, cluster.JobError):
+            if isinstance(answer, JobError):
                 if len(self.files) == 1:
                     raise answer
                 self._leave_out(f"{case.job.setup.spec.label} on {case.scene}", answer)

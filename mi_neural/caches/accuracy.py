@@ -17,7 +17,8 @@ import numpy as np
 
 from ..render.surface import scene_is_glossy
 from . import loss
-from .outgoing import OutgoingCache, OutgoingField, OutgoingShape, OutgoingTraining, fitted, training_paths
+from .outgoing import OutgoingCache, OutgoingTraining, fitted, training_paths
+from .outgoing_field import OutgoingField, OutgoingShape
 from .trainer import found
 from .training_paths import PathRecords
 from .voxels import Voxels, cell_sums, check_box, main_axis
@@ -176,7 +177,7 @@ class MeasuredField:
         self.grid = Accuracy(*field.box, constants, scale=float(field.scale[0]))
 
     def query(self, *surface):
-        """The field's answer, see :meth:`~mi_neural.caches.outgoing.OutgoingField.query`."""
+        """The field's answer, see :meth:`~mi_neural.caches.outgoing_field.OutgoingField.query`."""
         return self.field.query(*surface)
 
     def refresh(self) -> None:

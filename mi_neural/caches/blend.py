@@ -104,7 +104,7 @@ class Blend:
 
 
 class OutgoingBlend(Blend):
-    """The same of an :class:`~mi_neural.caches.outgoing.OutgoingField`, with its queries."""
+    """The same of an :class:`~mi_neural.caches.outgoing_field.OutgoingField`, with its queries."""
 
     def query(self, x, n, w, albedo, roughness):
         """Radiance that leaves the surface towards `w`; never negative, and 0 where an input is not usable."""

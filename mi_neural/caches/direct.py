@@ -18,11 +18,12 @@ import numpy as np
 
 from ..render.sampling import PathSampler
 from . import encoding, loss
-from .field import Field, FieldShape, Weights
+from .field import Field
 from .schedule import Ramp
 from .trainer import Trainer, found
 from .visibility import initialize_he
 from .voxels import Ages
+from .weights import FieldShape, Weights
 
 #: Slope of the output below 0.
 LEAK = 0.01

@@ -20,7 +20,7 @@ from ..render import vertex
 from ..render.sampling import PathSampler
 from . import encoding, loss
 from .blend import Blend
-from .field import Field, FieldShape
+from .field import Field
 from .material import material_of, needs_material
 from .places import N_PLACES
 from .records import TrainingRecords
@@ -28,6 +28,7 @@ from .reliability import Reliability
 from .trainer import Trainer, found
 from .training_paths import Suffixes, trace_training_paths
 from .voxels import Ages
+from .weights import FieldShape
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
 TARGET_MAX = 1e4

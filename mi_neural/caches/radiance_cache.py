@@ -14,7 +14,7 @@ import numpy as np
 from ..render.frozen import undisturbed
 from .field import CacheFileError
 from .optimizer import own_copy
-from .outgoing import OutgoingField, OutgoingShape
+from .outgoing_field import OutgoingField, OutgoingShape
 from .presets import PRESETS, RadianceCacheGuide, RadianceCaching
 from .voxels import check_box
 

@@ -23,7 +23,7 @@ from .incident import IncidentCache
 class HarmonicShape:
     """Sizes of a harmonic field.
 
-    n_levels, base_resolution, per_level_scale   of the grid, see :class:`~mi_neural.caches.field.FieldShape`
+    n_levels, base_resolution, per_level_scale   of the grid, see :class:`~mi_neural.caches.weights.FieldShape`
     hashmap_size   most numbers of a level
     degree         of the spherical harmonics
     """
@@ -59,7 +59,7 @@ class HarmonicShape:
 
 
 class HarmonicWeights:
-    """One set of coefficients. A PyTree, with the protocol of :class:`~mi_neural.caches.field.Weights`."""
+    """One set of coefficients. A PyTree, with the protocol of :class:`~mi_neural.caches.weights.Weights`."""
 
     DRJIT_STRUCT = {"grid": object}  # noqa: RUF012
     order = None  # nothing is packed

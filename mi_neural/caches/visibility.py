@@ -18,11 +18,12 @@ from ..render.media import media_of
 from ..render.sampling import PathSampler
 from ..render.tracking import shadowed
 from . import encoding
-from .field import FieldShape, TrainedField, Weights
+from .field import TrainedField
 from .optimizer import Stride, descend, own_copy
 from .schedule import Ramp
 from .trainer import Trainer, found
 from .voxels import Ages
+from .weights import FieldShape, Weights
 
 #: Steps whose points are found in one go, where there are so many to do.
 BATCH = 8

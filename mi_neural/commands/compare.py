@@ -9,8 +9,9 @@ from typing import Annotated
 
 import typer
 
-from mi_neural.bench import benchmark, cluster, collection, denoise, elsewhere, load, report, suite, terminal
+from mi_neural.bench import benchmark, collection, denoise, elsewhere, load, report, suite, terminal
 from mi_neural.bench.load import InputError
+from mi_neural.bench.workers import connect
 from mi_neural.commands import options
 
 DEFAULT_SECONDS = "1,2,4,8"
@@ -128,7 +129,7 @@ def compare(
         terminal.require_folder(reference_cache)
 
     terminal.set_variant(variant)
-    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
+    with terminal.Bars() as bars, connect(scheduler) as workers:
         comparison = suite.Suite(files, settings, output, bars, workers)
         comparison.run()
     found = comparison.report(shlex.join(["mi-neural", *sys.argv[1:]]))

@@ -11,6 +11,7 @@ import typer
 from mi_neural.bench import benchmark, budget, cluster, denoise, environment, jobs, load, repeats, terminal
 from mi_neural.bench import reference as references
 from mi_neural.bench.load import InputError
+from mi_neural.bench.workers import connect
 from mi_neural.commands import options
 from mi_neural.image import exr, moments
 
@@ -141,7 +142,7 @@ def render(
 
         return advance
 
-    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
+    with terminal.Bars() as bars, connect(scheduler) as workers:
         if denoise_:
             bars("guides for the denoiser")
             guides, _ = denoise.render_guides(loaded.scene, seed)

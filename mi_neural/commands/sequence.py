@@ -12,6 +12,7 @@ import typer
 from mi_neural.bench import benchmark, changes, cluster, denoise, environment, load, plots, terminal
 from mi_neural.bench import sequence as sequences
 from mi_neural.bench.load import InputError
+from mi_neural.bench.workers import ClusterError, connect
 from mi_neural.commands import options
 
 DEFAULT_FRAMES = 60
@@ -110,7 +111,7 @@ def sequence(
 
     interrupted, problem, notes = False, "", []
     plan = sequences.Plan(spp, pretrain, seed, denoise_)
-    with terminal.Bars() as bars, cluster.connect(scheduler) as workers:
+    with terminal.Bars() as bars, connect(scheduler) as workers:
         elsewhere = None
         if workers is not None:
             for case in cases:
@@ -132,7 +133,7 @@ def sequence(
         except KeyboardInterrupt:
             interrupted = True
             notes.append("Interrupted: not all frames are there. The same command goes on from here.")
-        except cluster.ClusterError as error:
+        except ClusterError as error:
             problem = str(error)
             notes.append(f"Not all frames are there: {problem}. The same command goes on from here.")
         if run.references is not None and run.references.exposures is not None:

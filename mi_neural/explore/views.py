@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.caches.blend import Blend
-from mi_neural.caches.outgoing import OutgoingField
+from mi_neural.caches.outgoing_field import OutgoingField
 from mi_neural.render import vertex
 from mi_neural.render.sampling import PathSampler
 from mi_neural.render.surface import scene_is_glossy, surface_of

@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .table import DIRECTION, ENVIRONMENT, LOCAL, LightTable, own
+from .entries import DIRECTION, ENVIRONMENT, LOCAL
+from .table import LightTable, own
 
 METHODS = ("auto", "kmeans", "emitter")
 

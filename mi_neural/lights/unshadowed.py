@@ -25,7 +25,8 @@ import numpy as np
 
 from .. import parameters
 from . import entries, ltc
-from .table import ENVIRONMENT, LOCAL, LightTable
+from .entries import ENVIRONMENT, LOCAL
+from .table import LightTable
 
 TRIANGLE, PARALLELOGRAM, DISK, SPHERE, DELTA, OTHER, SKY = range(7)
 #: Materials whose lobes are known, by the names of their classes.

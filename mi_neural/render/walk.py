@@ -16,7 +16,8 @@ import mitsuba as mi
 from ..estimators.spread import PathSpread
 from . import path as paths
 from . import vertex
-from .media import Media, Scattering
+from .media import Media
+from .medium_path import Scattering
 from .surface import Surface, surface_of
 
 
