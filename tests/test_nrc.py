@@ -19,8 +19,9 @@ from test_vertex import lights, test_scene
 from mi_neural import scenes
 from mi_neural.caches import training_paths
 from mi_neural.caches.field import CacheFileError, Field
-from mi_neural.caches.outgoing import OutgoingTraining, Places, trace_outgoing
+from mi_neural.caches.outgoing import OutgoingTraining, trace_outgoing
 from mi_neural.caches.outgoing_field import OutgoingField, OutgoingShape
+from mi_neural.caches.places import Places
 from mi_neural.caches.records import empty_surfaces, packed
 from mi_neural.estimators.spread import PathSpread, camera_spread
 from mi_neural.render.sampling import PathSampler

@@ -142,7 +142,7 @@ def test_training_that_is_queued_counts_as_training():
     integrator, _ = load.build_integrator(load.parse_integrator("nrc"), loaded.carried)
     integrator.train(loaded.scene, 16)
     found = split.measure(loaded.scene, integrator, 1, frames=3)
-    alone = split.kernels(lambda: integrator.train(loaded.scene, 1))[1]
+    alone = np.median([split.kernels(lambda: integrator.train(loaded.scene, 1))[1] for _ in range(5)])  # as `found` is
     print(f"training {1e3 * found.train:.2f} ms, tracing {1e3 * found.trace:.2f}; a step alone {1e3 * alone:.2f}")
     assert found.train > found.trace and found.train > 0.3 * alone
 
