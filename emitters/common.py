@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural import parameters, plan
-from mi_neural.lights.table import LightTable, ends_the_process
+from mi_neural.lights.table import LightTable
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.frozen import is_recording
 
@@ -69,12 +69,8 @@ class LightSampler(mi.Emitter):
         """What chooses lights in `scene`; None where there is nothing to choose, at no cost then.
 
         The table is made anew where the scene is another one, or its lights changed. Raises RuntimeError inside a
-        function that the user has frozen: a replay would show lights as they were. ValueError where it would end the
-        process.
+        function that the user has frozen: a replay would show lights as they were.
         """
-        self._check(not ends_the_process(scene), "on a GPU no light sampler works in a scene with an environment map "
-                    "together with other lights; leave it out, for example {'type': 'neural_path'}, or type "
-                    "mi.set_variant('llvm_ad_rgb')")  # fmt: skip
         if is_recording() and not (self.scene.knows(scene) and self.edits is None):
             raise RuntimeError(
                 f"{self.plugin}: inside a function frozen by dr.freeze a light sampler cannot follow the lights; leave "
