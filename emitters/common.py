@@ -9,6 +9,7 @@ from mi_neural import parameters, plan
 from mi_neural.lights.table import LightTable
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.frozen import is_recording
+from mi_neural.render.kernels import on_gpu
 
 
 class LightSampler(mi.Emitter):
@@ -69,7 +70,8 @@ class LightSampler(mi.Emitter):
         """What chooses lights in `scene`; None where there is nothing to choose, at no cost then.
 
         The table is made anew where the scene is another one, or its lights changed. Raises RuntimeError inside a
-        function that the user has frozen: a replay would show lights as they were.
+        function that the user has frozen: a replay would show lights as they were. ValueError where it would end the
+        process.
         """
         if is_recording() and not (self.scene.knows(scene) and self.edits is None):
             raise RuntimeError(
@@ -81,6 +83,11 @@ class LightSampler(mi.Emitter):
             self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
             self.edits = _edits_of(scene) if self.plan.modelled("light_sampler") else None
+            self._check(
+                not (on_gpu() and self.plan.modelled("environment_cells")),
+                "environment_cells ends the process on a GPU (Dr.Jit 1.5.0); set environment_cells=0, or type "
+                "mi.set_variant('llvm_ad_rgb')",
+            )
         if self.edits is None:
             return None
         with dr.suspend_grad():

@@ -235,8 +235,15 @@ def test_as_on_a_gpu_image_is_that_of_path(monkeypatch, place, name):
     """There emitters that sample themselves are called through pointers."""
     monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
     scene, path = place("kinds")
-    assert LightTable(scene).others is None
+    assert LightTable(scene).others is None and LightTable(place("32")[0]).others == ()
     assert_same_mean(renders(scene, path_with(name), 16, 256), path, f"pointers, {name}", relative=1e-5)
+
+
+def test_parts_of_the_environment_are_refused_on_a_gpu(monkeypatch, place):
+    """There Dr.Jit 1.5.0 ends the process."""
+    monkeypatch.setattr("mi_neural.emitters.common.on_gpu", lambda: True)
+    with pytest.raises(ValueError, match="set environment_cells=0"):
+        path_with("cells").render(place("envmap")[0], spp=1)
 
 
 @pytest.mark.parametrize("name, depth", [("power", 2), ("tree", 4), ("clusters", 2), ("trained", 4)])

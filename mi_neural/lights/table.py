@@ -113,10 +113,10 @@ class LightTable:
         self.forms = frozenset(form.tolist())
         others = np.unique(columns["emitter"][: len(form)][form == OTHER])
         #: Indices of the emitters that sample themselves; None where these are called through pointers: if they are too
-        #: many to be called one by one, and on a GPU, where Dr.Jit 1.5.0 then ends the process if one is an environment
-        #: map ("jit_var(r0): unknown variable")
-        one_by_one = len(others) <= FEW < self.n_emitters and not on_gpu()
-        self.others = tuple(others.tolist()) if one_by_one else None
+        #: many to be called one by one, and if one is an environment on a GPU, where such a call in a recorded function
+        #: ends the process (Dr.Jit 1.5.0, "jit_var(r0): unknown variable")
+        ended = on_gpu() and bool((columns["kind"] == ENVIRONMENT).any())
+        self.others = tuple(others.tolist()) if len(others) <= FEW < self.n_emitters and not ended else None
         self.any_flat, self.all_flat = self._has(TRIANGLE, PARALLELOGRAM), self.forms <= {TRIANGLE, PARALLELOGRAM}
         sampled = np.isin(columns["form"], (*PLANE, *CYLINDERS, SPHERE))
         self.all_plain = bool((columns["plain"] | ~sampled).all())
