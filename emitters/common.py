@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural import parameters, plan
-from mi_neural.lights.table import LightTable, ends_the_process
+from mi_neural.lights.table import LightTable
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.frozen import is_recording
+from mi_neural.render.kernels import on_gpu
 
 
 class LightSampler(mi.Emitter):
@@ -72,9 +73,6 @@ class LightSampler(mi.Emitter):
         function that the user has frozen: a replay would show lights as they were. ValueError where it would end the
         process.
         """
-        self._check(not ends_the_process(scene), "on a GPU no light sampler works in a scene with an environment map "
-                    "together with other lights; leave it out, for example {'type': 'neural_path'}, or type "
-                    "mi.set_variant('llvm_ad_rgb')")  # fmt: skip
         if is_recording() and not (self.scene.knows(scene) and self.edits is None):
             raise RuntimeError(
                 f"{self.plugin}: inside a function frozen by dr.freeze a light sampler cannot follow the lights; leave "
@@ -85,6 +83,11 @@ class LightSampler(mi.Emitter):
             self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
             self.edits = _edits_of(scene) if self.plan.modelled("light_sampler") else None
+            self._check(
+                not (on_gpu() and self.plan.modelled("environment_cells")),
+                "environment_cells ends the process on a GPU (Dr.Jit 1.5.0); set environment_cells=0, or type "
+                "mi.set_variant('llvm_ad_rgb')",
+            )
         if self.edits is None:
             return None
         with dr.suspend_grad():

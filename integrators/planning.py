@@ -11,7 +11,6 @@ from mi_neural import plan
 from mi_neural.light_noise import light_noise
 from mi_neural.lights.entries import is_emissive_mesh
 from mi_neural.lights.inexact import inexact
-from mi_neural.lights.table import ends_the_process
 
 #: Keys of the network's sizes, as fields of its shape.
 SIZES = {"levels": "n_levels", "hashmap_size": "hashmap_size", "width": "width", "hidden_layers": "n_hidden"}
@@ -28,8 +27,6 @@ def make_plan(integrator, scene, sensor) -> plan.ScenePlan:
         partial(light_noise, scene, sensor) if integrator.CHOOSES_LIGHTS else None,
     )  # fmt: skip
     made = plan.of_integrator(facts, request)
-    if integrator.nested_sampler is None and ends_the_process(scene):
-        made.decisions["light_sampler"] = plan.left_out("none works on a GPU beside an environment map, see doc limits")
     sampler = sampler_of(integrator, made)
     if sampler is not None:
         theirs = sampler.make_plan(facts).decisions
@@ -67,7 +64,7 @@ def fits(theirs, mine) -> bool:
 def exact_sampler(scene):
     """A light sampler for an integrator without one, where Mitsuba's own next-event estimation is wrong; else None."""
     emitters = scene.emitters()
-    if not any(inexact(emitter) for emitter in emitters) or ends_the_process(scene):
+    if not any(inexact(emitter) for emitter in emitters):
         return None
     n = sum(e.get_shape().primitive_count() if is_emissive_mesh(e) else 1 for e in emitters)
     return mi.load_dict({"type": "uniform_lights" if n < 3 else "power_lights"}) if n <= plan.MOST_LOOKED_AT else None

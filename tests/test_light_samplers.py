@@ -13,7 +13,6 @@ from test_vertex import lights, test_scene
 
 from mi_neural.caches.visibility import VisibilityTraining
 from mi_neural.lights.table import LightTable
-from mi_neural.render.kernels import on_gpu
 
 SAMPLERS = {
     "uniform": {"type": "uniform_lights"},
@@ -79,8 +78,6 @@ def place(tmp_path_factory):
     known, folder = {}, tmp_path_factory.mktemp("meshes")
 
     def get(kind, depth=2):
-        if kind == "kinds" and on_gpu():
-            pytest.skip("on a GPU no light sampler works beside an environment map")
         if kind not in known:
             known[kind] = test_scene(many(kind, folder), 12)
         if (kind, depth) not in known:
@@ -233,26 +230,20 @@ def nirc(name, **keys):
     )
 
 
-@pytest.mark.parametrize("keys", [
-    {"type": "plain_path"}, {"type": "nirc"}, {"type": "nrc"}, {"type": "neural_path"}, {"type": "nirc_two_level"},
-])  # fmt: skip
-def test_environment_map_among_lights_is_refused_on_a_gpu_and_not_planned(monkeypatch, keys):
-    """There Dr.Jit 1.5.0 ends the process, also where the plan would choose a light sampler."""
+@pytest.mark.parametrize("name", ["power", "untrained"])
+def test_as_on_a_gpu_image_is_that_of_path(monkeypatch, place, name):
+    """There emitters that sample themselves are called through pointers."""
     monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
-    scene, cheap = test_scene(many("kinds", None), 4), {} if keys["type"] == "plain_path" else {"train_samples": 64}
-    with pytest.raises(ValueError, match=r"power_lights: on a GPU .* environment map together with other lights"):
-        mi.load_dict({**keys, **cheap, "light_sampler": SAMPLERS["power"]}).render(scene, spp=1)
-    integrator = mi.load_dict({**keys, **cheap, "max_depth": 3})
-    assert np.isfinite(np.array(integrator.render(scene, spp=1))).all()
-    assert integrator.light_sampler is None
+    scene, path = place("kinds")
+    assert LightTable(scene).others is None and LightTable(place("32")[0]).others == ()
+    assert_same_mean(renders(scene, path_with(name), 16, 256), path, f"pointers, {name}", relative=1e-5)
 
 
-def test_integrators_that_always_choose_lights_refuse_an_environment_map_among_them_on_a_gpu(monkeypatch):
-    monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
-    scene = test_scene(many("kinds", None), 4)
-    for type_ in ("nvc_direct", "restir_di"):
-        with pytest.raises(ValueError, match=r"on a GPU .* environment map together with other lights"):
-            mi.load_dict({"type": type_}).render(scene, spp=1)
+def test_parts_of_the_environment_are_refused_on_a_gpu(monkeypatch, place):
+    """There Dr.Jit 1.5.0 ends the process."""
+    monkeypatch.setattr("mi_neural.emitters.common.on_gpu", lambda: True)
+    with pytest.raises(ValueError, match="set environment_cells=0"):
+        path_with("cells").render(place("envmap")[0], spp=1)
 
 
 @pytest.mark.parametrize("name, depth", [("power", 2), ("tree", 4), ("clusters", 2), ("trained", 4)])

@@ -353,11 +353,3 @@ def test_light_sampler_that_would_not_be_asked_is_refused():
 def test_it_cannot_be_nested():
     with pytest.raises(RuntimeError, match="whole frames"):
         integrator().sample(None, None, None)
-
-
-def test_environment_map_with_other_lights_is_refused_on_a_gpu(monkeypatch):
-    """There Dr.Jit 1.5.0 ends the process."""
-    monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
-    with pytest.raises(ValueError, match="environment map together with other lights; leave it out"):
-        integrator().render(many_lights(4), spp=1)
-    assert np.isfinite(np.array(mi.render(test_scene(lights("envmap"), 4), integrator=integrator(), spp=1))).all()

@@ -40,12 +40,6 @@ MAX_LIGHTS = 2**24
 SHADOW_EPSILON = 1e-3
 
 
-def ends_the_process(scene) -> bool:
-    """Whether a choice among the lights of `scene` ends the process: on a GPU, where there is an environment map
-    together with other lights. Dr.Jit 1.5.0 did so on an H100 ("jit_var(r0): unknown variable")."""
-    return on_gpu() and scene.environment() is not None and len(scene.emitters()) > 1
-
-
 class LightTable:
     """What emits, as arrays of `n_lights` entries (structure of arrays; a PyTree).
 
@@ -118,8 +112,11 @@ class LightTable:
         form = columns["form"][: self.n_lights - n_texels]
         self.forms = frozenset(form.tolist())
         others = np.unique(columns["emitter"][: len(form)][form == OTHER])
-        #: Indices of the emitters that sample themselves; None where these are too many to be called one by one
-        self.others = tuple(others.tolist()) if len(others) <= FEW < self.n_emitters else None
+        #: Indices of the emitters that sample themselves; None where these are called through pointers: if they are too
+        #: many to be called one by one, and if one is an environment on a GPU, where such a call in a recorded function
+        #: ends the process (Dr.Jit 1.5.0, "jit_var(r0): unknown variable")
+        ended = on_gpu() and bool((columns["kind"] == ENVIRONMENT).any())
+        self.others = tuple(others.tolist()) if len(others) <= FEW < self.n_emitters and not ended else None
         self.any_flat, self.all_flat = self._has(TRIANGLE, PARALLELOGRAM), self.forms <= {TRIANGLE, PARALLELOGRAM}
         sampled = np.isin(columns["form"], (*PLANE, *CYLINDERS, SPHERE))
         self.all_plain = bool((columns["plain"] | ~sampled).all())
