@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from expectation import assert_mean, assert_same_mean, renders
-from media_scenes import ball, cube, everywhere, fog, lamp, rgb, room, smoke
+from media_scenes import ball, cube, everywhere, fog, lamp, rgb, room, smoke, wall
 
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
 from mi_neural.caches.places import Places
@@ -23,6 +23,8 @@ SCENES = {
     "colours": (lambda: room(box=cube(fog((0.5, 2.0, 4.0), (0.9, 0.6, 0.8)))), "volpathmis"),
     "in rough glass": (lambda: room(ball=ball(fog(2.0, 0.9), {"type": "roughdielectric", "alpha": 0.3})), "volpath"),
     "half open shell": (lambda: room(box=cube(fog(2.0), HALF_OPEN)), "volpath"),
+    "half open walls": (lambda: room(box=cube(fog(), size=0.3), **{
+        f"wall{k}": wall((0, 0, 1 + 0.3 * k), (0, 1, 0), 0, bsdf=HALF_OPEN) for k in range(3)}), "volpath"),
 }
 LIMITS = [{"max_depth": 2}, {"max_depth": 3, "rr_depth": 1}, {"max_depth": 4, "hide_emitters": True}]
 NAMES = ("nrc", "neural_path")
