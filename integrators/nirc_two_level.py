@@ -302,9 +302,9 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         cancels = two_level.residual(mi.Color3f(0), followed, α, q, kept)
         return two_level.combine(followed + other, mi.Float(INNER), cancels, 1, α), sampler
 
-    def incident_radiance(self, scene, field, path, found, after, sampler):
+    def incident_radiance(self, scene, lights, field, path, found, after, sampler):
         field = field.field if isinstance(field, Foreseen) else field
-        return super().incident_radiance(scene, field, path, found, after, sampler)
+        return super().incident_radiance(scene, lights, field, path, found, after, sampler)
 
     def to_string(self):
         return (
