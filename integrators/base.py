@@ -18,6 +18,7 @@ from mi_neural.integrators.checks import (
 )
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
+from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
 from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.media import Media
@@ -87,13 +88,16 @@ class FilmIntegrator(mi.SamplingIntegrator):
         """
         raise NotImplementedError(f"{type(self).__name__} must define estimate()")
 
-    def bind_media(self, scene, sensor, known: bool) -> None:
-        """Look for media in a scene, which is `known` or another one, and where the camera is in one."""
-        medium = sensor.get_medium() if hasattr(sensor, "get_medium") else None
-        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
-            self.film_state.forget_scene()
+    def bind_media(self, scene, sensor, bound: BoundScene) -> None:
+        """Look for media in a scene, that of `bound`, where it is another one, and where the camera is in one."""
+        medium, state = sensor.get_medium() if hasattr(sensor, "get_medium") else None, self.film_state
+        of_another = state.media_of is None or state.media_of is not bound.parts
+        if of_another or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
+            state.media_of = None  # what is refused, or interrupted, is looked at anew the next time
+            state.forget_scene()
             self.media = Media.of(scene, [sensor])
             check_phase_functions(scene, sensor, self.plugin)
+            state.media_of = bound.parts
         elif self.media is not None and self.media.edited():
             self.film_state.forget_scene()
         if self.media is None:
@@ -253,6 +257,7 @@ class _FilmState:
         self.placed: tuple[int, int] | None = None  # see place_samples()
         self.nonfinite: list = []
         self.n_bound = self.n_forgotten = 0
+        self.media_of: tuple | None = None  # the parts of the scene whose media are bound
         self.said: set[str] = set()
         self.entered = False  # whether Mitsuba's own render() is under way, which calls sample()
         self._estimate = None

@@ -173,7 +173,7 @@ class CacheIntegrator(LearningIntegrator):
             with dr.suspend_grad():
                 self.state.lights = self.light_sampler.lights(scene, view, train=learn)
         if self.renders_media:
-            self.bind_media(scene, sensor, same)
+            self.bind_media(scene, sensor, self.state.bound)
         self.cache.recordable = self.film_state.scene_records(scene)
         if not self.needs_cache:
             if not self.state.measured:
