@@ -20,7 +20,7 @@ from mi_neural.integrators.learning import LearningIntegrator
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
-from mi_neural.render.frozen import undisturbed
+from mi_neural.render.frozen import locked, undisturbed
 from mi_neural.render.sampling import PathSampler
 
 #: Frames that `train_frames = -1` trains at least and at most.
@@ -230,6 +230,7 @@ class CacheIntegrator(LearningIntegrator):
         self.cache.train(scene, view, self.state.lights, frames=None if auto else self.train_frames,
                          at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1], progress=progress)  # fmt: skip
 
+    @locked
     def train_first(self, scene, sensor=0, progress=None) -> dict:
         """Train now as the first image would (`train_frames`), if nothing was learned yet. Returns the statistics."""
         sensor = self._sensor(scene, sensor)
@@ -239,6 +240,7 @@ class CacheIntegrator(LearningIntegrator):
         self._publish()
         return self.statistics()
 
+    @locked
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train `frames` frames now. `progress` is called with (done, total). Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
@@ -248,6 +250,7 @@ class CacheIntegrator(LearningIntegrator):
         self._publish()
         return self.statistics()
 
+    @locked
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
         """Train for about `seconds` of wall time. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
@@ -277,6 +280,7 @@ class CacheIntegrator(LearningIntegrator):
         finally:
             self.state.images, self.state.queries, self.state.image_open = known
 
+    @locked
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. What was learned so far stays as it is."""
         sensor = self._sensor(scene, sensor)
@@ -323,6 +327,7 @@ class CacheIntegrator(LearningIntegrator):
             s["ns_per_query"] = self.state.ns_per_query
         return s
 
+    @locked
     def measure_query(self, n: int = 2**16) -> float:
         """Nanoseconds per cache query, as :meth:`probe` asks it. Also kept for :meth:`statistics`."""
         field = self.cache.queried

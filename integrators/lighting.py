@@ -11,7 +11,7 @@ from mi_neural.integrators.gradients import moved, name_black_lamps
 from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
-from mi_neural.render.frozen import LOCK
+from mi_neural.render.frozen import LOCK, locked
 
 
 def light_sampler_of(props):
@@ -110,6 +110,7 @@ class LightSamplingIntegrator(FilmIntegrator):
             self.light_sampler.reseed(seed)
         self.reset()
 
+    @locked
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train the light sampler for so many frames. `progress` is called with (done, total). Returns `statistics`."""
         sensor = sensor_of(scene, sensor, self.plugin)
@@ -119,6 +120,7 @@ class LightSamplingIntegrator(FilmIntegrator):
                 progress(k + 1, frames)
         return self.statistics()
 
+    @locked
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. A cache without training records is left unchanged."""
         sensor = sensor_of(scene, sensor, self.plugin)

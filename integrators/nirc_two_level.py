@@ -22,6 +22,8 @@ from mi_neural.integrators.progressive import UNBIASED, Parts
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.ends import Ends
+from mi_neural.render.film import Area
+from mi_neural.render.frozen import locked
 
 MODES = ("unbiased", "progressive")
 #: Queries per vertex with `every_vertex`: the direction that is followed, and another.
@@ -132,6 +134,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
             if self.mixed is None and (self.choice.rendered >= pilot.WORTH or self.compiling):
                 self.choice.measure(self, scene, sensor)
 
+    @locked
     def measure(self, scene, sensor=0) -> dict:
         """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
@@ -151,6 +154,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         self.choice.rendered = before + (spp or sensor.sampler().sample_count()) * pixels
         return result
 
+    @locked
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. What was learned and measured so far stays as it is."""
         known, self.compiling = self.choice.state(), True
