@@ -124,13 +124,20 @@ class LightSamplingIntegrator(FilmIntegrator):
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. A cache without training records is left unchanged."""
         sensor = sensor_of(scene, sensor, self.plugin)
-        fresh = not self.statistics().get("visibility_steps")
-        with dr.suspend_grad():
-            for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
-                dr.eval(self.render(scene, sensor, 0, spp))
-        dr.sync_thread()
-        if fresh:
-            self.reset()
+        fresh = self.untrained
+        try:
+            with dr.suspend_grad():
+                for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
+                    dr.eval(self.render(scene, sensor, 0, spp))
+            dr.sync_thread()
+        finally:
+            if fresh:
+                self.reset()
+
+    @property
+    def untrained(self) -> bool:
+        """Whether nothing has been learned."""
+        return not self.statistics().get("visibility_steps")
 
     def statistics(self) -> dict:
         """Facts since the last reset: what the light sampler says of itself."""

@@ -71,6 +71,9 @@ class Choice:
     Raises ValueError for keys out of range.
     """
 
+    #: Camera samples of the image that is being rendered.
+    under_way = 0
+
     def __init__(self, cache_samples, residual_samples, residual_probability, alpha, roulette=None, guide=None):
         if cache_samples is not None and cache_samples < 0:
             raise ValueError(f"cache_samples is {cache_samples}; give 0 (path tracing) or more")
@@ -135,7 +138,7 @@ class Choice:
         self.split = Split(**known)
         self.table: list[dict] = []
         self.measured_at = -1
-        self.rendered = 0  # camera samples, those of the image under way included
+        self.rendered = 0  # camera samples of finished images
         self.seconds = 0.0
 
     def split_into(self, n_traced: int) -> None:
@@ -177,11 +180,15 @@ class Choice:
         steps = integrator.cache.steps
         if self.measured_at >= 0 and steps < 2 * max(self.measured_at, 1):
             return
-        start = time.perf_counter()
+        start, before = time.perf_counter(), self.state()
         self.measured_at = steps
-        if not self.fixed:
-            self.know_alpha(integrator, scene, sensor, self.given["alpha"] in (None, BY_PLACE))
-            self._compare(Pilot(integrator, scene, sensor))
+        try:
+            if not self.fixed:
+                self.know_alpha(integrator, scene, sensor, self.given["alpha"] in (None, BY_PLACE))
+                self._compare(Pilot(integrator, scene, sensor))
+        except BaseException:  # Ctrl-C: what stands then is a candidate, chosen by nothing
+            self.restore(before)
+            raise
         dr.sync_thread()
         self.seconds += time.perf_counter() - start
 
