@@ -218,7 +218,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
             self.bound_lights, self.bound_field, samples, sizes, [dr.opaque(mi.Float, v) for v in settings],
             record=self.records and not is_recording() and self.film_state.scene_records(scene), sums=sums,
         )  # fmt: skip
-        self.film_state.count(n_bad)
+        self.film_state.nonfinite.add(n_bad)
         return place, values
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -247,6 +247,25 @@ class FilmIntegrator(mi.SamplingIntegrator):
                 for c in ("RGB" if self.CHANNELS[n] == 3 else " ")]  # fmt: skip
 
 
+class Nonfinite:
+    """How many samples were not finite. They are read when the number is asked for: no pass is waited for."""
+
+    def __init__(self):
+        self.counts: list = []
+
+    def add(self, n_bad) -> None:
+        """Take in how many samples of a pass were not finite."""
+        if is_recording():
+            return
+        self.counts.append(n_bad)
+        if len(self.counts) > 256:
+            self.counts = [sum(self.counts[1:], self.counts[0])]
+            dr.eval(self.counts)
+
+    def __int__(self):
+        return sum(int(n[0]) for n in self.counts)
+
+
 class _FilmState:
     """What rendering changes. Apart, because a recorded function is made anew whenever an attribute of the integrator
     that it belongs to changes; this object it takes as a whole."""
@@ -255,7 +274,7 @@ class _FilmState:
         self.passes = Passes()
         self.planned_spp: int | None = None
         self.placed: tuple[int, int] | None = None  # see place_samples()
-        self.nonfinite: list = []
+        self.nonfinite = Nonfinite()
         self.n_bound = self.n_forgotten = 0
         self.media_of: tuple | None = None  # the parts of the scene whose media are bound
         self.said: set[str] = set()
@@ -288,17 +307,8 @@ class _FilmState:
         self._records = None
         self.n_forgotten += 1
 
-    def count(self, n_bad) -> None:
-        """Take in how many samples of a pass were not finite."""
-        if is_recording():
-            return
-        self.nonfinite.append(n_bad)
-        if len(self.nonfinite) > 256:
-            self.nonfinite = [sum(self.nonfinite[1:], self.nonfinite[0])]
-            dr.eval(self.nonfinite)
-
     def statistics(self) -> dict:
-        s = {"nonfinite": sum(int(n[0]) for n in self.nonfinite)}
+        s = {"nonfinite": int(self.nonfinite)}
         if self._records is False:
             s["recorded"] = False
         return s

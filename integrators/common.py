@@ -15,6 +15,7 @@ from mi_neural import plan
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.files import damaged
 from mi_neural.integrators import gradients, planning
+from mi_neural.integrators.base import Nonfinite
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.learning import LearningIntegrator
 from mi_neural.integrators.lighting import light_sampler_of
@@ -115,8 +116,9 @@ class CacheIntegrator(LearningIntegrator):
         return 0.0
 
     def follow(self, other: CacheIntegrator, scene, sensor) -> None:
-        """Render with what `other` has bound, whose cache this integrator was given, and train nothing."""
-        self.state.lights = other.bound_lights
+        """Render with what `other` has bound, whose cache this integrator was given, and train nothing. `other` counts
+        the samples that are not finite."""
+        self.state.lights, self.film_state.nonfinite = other.bound_lights, other.film_state.nonfinite
         if not self.state.measured:
             self.measure_scene(scene, self._view(sensor))
 
@@ -145,7 +147,7 @@ class CacheIntegrator(LearningIntegrator):
         """Forget what was learned; the next image trains anew. Compiled kernels are kept."""
         self.cache.reset()
         self.state.reset()
-        self.film_state.nonfinite = []
+        self.film_state.nonfinite = Nonfinite()
         if self.light_sampler is not None:
             self.light_sampler.reset()
 

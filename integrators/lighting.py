@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.base import FilmIntegrator
+from mi_neural.integrators.base import FilmIntegrator, Nonfinite
 from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.gradients import moved, name_black_lamps
 from mi_neural.integrators.planning import exact_sampler
@@ -101,6 +101,7 @@ class LightSamplingIntegrator(FilmIntegrator):
     def reset(self) -> None:
         """Forget what was learned. Compiled kernels are kept."""
         self.lights = None
+        self.film_state.nonfinite = Nonfinite()
         if self.light_sampler is not None:
             self.light_sampler.reset()
 

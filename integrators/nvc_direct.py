@@ -243,10 +243,9 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
 
     def reset(self) -> None:
         """Forget what was learned; the next image trains anew."""
-        self.light_sampler.reset()
+        super().reset()
         self.cache.reset()
         self.bound = BoundScene()
-        self.lights = None  # what chooses lights; None: the scene itself
         self.unshadowed: UnshadowedLights | None = None
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
         self.mixed = True  # whether materials have mirror lobes beside others
@@ -257,10 +256,18 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
 
     def statistics(self) -> dict:
         """Facts since the last reset."""
-        facts = dict(self.light_sampler.statistics())
+        facts = super().statistics()
         if self.only_light is not None:
             facts |= {"lights": 1, "light_groups": 1} | self.only_light.statistics
-        return facts | (self.cache.statistics if self.kind == "radiance" else {})
+            facts["seconds_train"] = facts["seconds_visibility"]
+        if self.kind == "radiance":
+            facts |= self.cache.statistics
+            facts["seconds_train"] += facts["seconds_direct"]
+        return facts
+
+    @property
+    def untrained(self) -> bool:
+        return super().untrained and not self.cache.steps
 
     def bind(self, scene, sensor, train: bool = True) -> None:
         """Train as the keys say, and have all ready for an image of `scene` as it is now."""

@@ -194,7 +194,9 @@ class Mixed:
                 self.unbiased.add(Parts.of(block, self.integrator.inner_channels, self.integrator))
                 self.n_unbiased += n
             else:
+                queries = nirc.state.queries
                 block = Parts.of(nirc.render_block(scene, sensor, seed, n), BIASED, nirc)
+                self.integrator.state.queries += nirc.state.queries - queries
                 self.biased.add(block)
                 self.squares = self.squares + n * np.square(block.indirect)
                 self.n_biased, self.n_blocks = self.n_biased + n, self.n_blocks + 1

@@ -255,14 +255,16 @@ def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixe
         L, valid, extra = estimate(scene, lights, field, sampler, ray, settings, active)
         L = L * weight if special is not None else film_colour(L * weight, ray.wavelengths, active)
         ok = dr.all(dr.isfinite(L))
-        L, one = dr.select(ok, L, 0), dr.select(ok & active, mi.Float(1), 0)
+        # A sample that is not finite counts nowhere, in alpha and channels neither
+        L, one, covered = dr.select(ok, L, 0), dr.select(ok & active, mi.Float(1), 0), dr.select(ok, coverage(valid), 0)
         if special is not None:
             n_channels = special.create_block().channel_count()
-            values = special.prepare_sample(L, ray.wavelengths, n_channels, one, coverage(valid), active)
+            values = special.prepare_sample(L, ray.wavelengths, n_channels, one, covered, active)
         else:
-            values = [L.x, L.y, L.z, *([coverage(valid)] if alpha else []), one]
+            values = [L.x, L.y, L.z, *([covered] if alpha else []), one]
         for name, size in channels.items():
-            values += [*extra[name]] if size == 3 else [mi.Float(extra[name])]
+            value = dr.select(ok, extra[name], 0)
+            values += [*value] if size == 3 else [mi.Float(value)]
         dr.eval(values, ok)  # one kernel; the sums below would otherwise run the whole estimate again, each
         n_bad = dr.count(~ok & active)
         if area.box:  # one value a pixel, the sum of its samples
