@@ -334,21 +334,27 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         si, bsdf, active = path.si, path.si.bsdf(), path.active
 
         # Direct light at the first surface that is not a mirror
-        if self.kind == "radiance":
-            direct = albedo(si, bsdf, active) * self.cache.query(si.p) + self.mirrored(scene, si, bsdf, sampler, active)
-        elif self.mode == "neural":
-            direct = self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), active)
-            direct += self.mirrored(scene, si, bsdf, sampler, active)
+        if self.kind == "visibility" and self.mode == "sampled":
+            direct, valid = self.sampled(scene, path, sampler)
         else:
-            direct = self.sampled(scene, path, sampler)
+            if self.kind == "radiance":
+                direct = albedo(si, bsdf, active) * self.cache.query(si.p)
+            else:
+                direct = self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), active)
+            direct += self.mirrored(scene, si, bsdf, sampler, active)
+            holes = active & vertex.has_null(bsdf)
+            opacity = 1 - dr.mean(bsdf.eval_null_transmission(si, holes))
+            valid = dr.select(holes, opacity, dr.select(path.valid, mi.Float(1), 0))
         L = path.L + dr.select(active, path.β * direct, 0)
-        return L, path.valid, self.extra(si, bsdf, sampler, active) if self.channels else {}
+        return L, valid, self.extra(si, bsdf, sampler, active) if self.channels else {}
 
     def sampled(self, scene, path, sampler):
-        """E = ∫ f Le cos dω, by `light_samples` shadow rays and one BSDF ray."""
+        """(direct light, whether the pixel is covered): E = ∫ f Le cos dω, by `light_samples` shadow rays and one BSDF
+        ray."""
         n = self.light_samples
         direct = paths.direct_light if n == 1 else partial(paths.several_lights, n)
-        return paths.bounce(scene, self.lights, path, sampler, paths.stratified(sampler), direct=direct)[0].direct
+        found, _ = paths.bounce(scene, self.lights, path, sampler, paths.stratified(sampler), direct=direct)
+        return found.direct, paths.advance(path, found).valid
 
     def mirrored(self, scene, si, bsdf, sampler, active):
         """Emission that the mirror lobes of a material with others beside show."""
