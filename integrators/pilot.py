@@ -82,10 +82,9 @@ class Choice:
                              "residual_probability")  # fmt: skip
         if residual_probability is not None and not 0 < residual_probability <= 1:
             raise ValueError(f"residual_probability is {residual_probability}; it must lie in (0, 1]")
-        if isinstance(alpha, str) and alpha != "cell":
-            raise ValueError(f"alpha is '{alpha}'; give 'cell' or a number in [0, 1]")
-        if alpha is not None and not isinstance(alpha, str) and not 0 <= alpha <= 1:
-            raise ValueError(f"alpha is {alpha}; give 'cell' or a number in [0, 1]")
+        number = isinstance(alpha, int | float) and not isinstance(alpha, bool) and 0 <= alpha <= 1
+        if not (number or alpha in (None, "cell")):
+            raise ValueError(f"alpha is {alpha!r}; give 'cell' or a number in [0, 1]")
         if roulette is not None and not (0 <= roulette < math.inf):
             raise ValueError(f"roulette is {roulette}; give 0 (by throughput) or a positive number")
         if guide is not None and not (0 <= guide < 1):

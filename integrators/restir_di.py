@@ -1,5 +1,7 @@
 """``restir_di``: direct light by reuse of light samples over pixels and frames."""
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -185,7 +187,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         self._check(self.spatial_samples >= 0,
                     f"spatial_samples is {self.spatial_samples}; give 0 (no reuse over pixels) or more")  # fmt: skip
         self._check(
-            self.spatial_radius > 0 or self.spatial_radius == -1,
+            0 < self.spatial_radius < math.inf or self.spatial_radius == -1,
             f"spatial_radius is {self.spatial_radius}; give -1 (by the film) or a number greater than 0",
         )
         self._check(-1 <= self.normal_threshold <= 1,
