@@ -218,7 +218,7 @@ class CacheIntegrator(LearningIntegrator):
         """What will be built in `scene`, what is left out, and why. Changes nothing."""
         sensor = self._sensor(scene, sensor)
         check_scene(scene, self.plugin, self.renders_media)
-        return planning.make_plan(self, scene, sensor)
+        return planning.make_plan(self, scene, self._view(sensor))
 
     def _publish(self) -> None:
         """Show Dr.Jit the cache as an attribute, once it no longer changes: then a function of the user's that renders
@@ -227,7 +227,7 @@ class CacheIntegrator(LearningIntegrator):
 
     def _view(self, sensor):
         """What is learned with in the place of `sensor`: other rays of it each time, where it cannot be recorded."""
-        return recordable(sensor, self.seed * 0x9E3779B9 + self.cache.steps)
+        return recordable(sensor, self.cache.seed * 0x9E3779B9 + self.cache.steps)
 
     def _train_first(self, scene, view, progress=None) -> None:
         auto, done, self.state.begun = self.train_frames < 0, self.cache.steps, True

@@ -318,7 +318,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         self._check(getattr(settings, "cache", None) is not None, "one light needs nvc_lights as light_sampler")
         if self.only_light is None:
             known = settings.cache
-            self.only_light = VisibilityCache(known.training, seed=self.seed, grid=known.grid, he=known.he)
+            self.only_light = VisibilityCache(known.training, seed=self.cache.seed, grid=known.grid, he=known.he)
         steps = settings.train_steps if self.only_light.steps else settings.train_frames
         with dr.resume_grad():
             self.only_light.train(scene, sensor, table, groups, frames=steps if train and not settings.freeze else 0)

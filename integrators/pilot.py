@@ -123,7 +123,7 @@ class Choice:
 
     def look_ahead(self, integrator, scene, sensor, anew: bool = False) -> None:
         """See that there is an outlook, with a guide if the division has one."""
-        given = scene, integrator._view(sensor), integrator.bound_lights, integrator.seed ^ 0x6F75746C
+        given = scene, integrator._view(sensor), integrator.bound_lights, integrator.cache.seed ^ 0x6F75746C
         if self.outlook is None or anew:
             self.outlook = Outlook.learn(*given)
         if self.split.guide > 0:

@@ -253,6 +253,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             check_scene(scene, "restir_di")
             s.reset()
             s.frames.clear()
+            s.power = None  # it has the lights of the scene before
             s.key, s.freeze = key, can_freeze_scene(scene)
 
         lights, facts = self._lights(scene, recordable(sensor, s.frame))

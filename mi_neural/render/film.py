@@ -103,7 +103,7 @@ class RaySensor:
         lane, seed = dr.arange(mi.UInt32, SIDE * SIDE), dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         sampler = PathSampler.make(lane, seed)
         place = mi.Point2f(mi.Float(lane % SIDE), mi.Float(lane // SIDE)) + sampler.next_2d()
-        return cls(film_rays(sensor, place / SIDE, sampler), SIDE)
+        return cls(film_rays(sensor, place / SIDE, sampler), SIDE, sensor.get_medium())
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         n, side = dr.width(self.time), self.side
