@@ -47,7 +47,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         super().__init__(props.props)
         self.plugin = props.plugin_name()
         self.max_depth = props.get("max_depth", -1)
-        self.rr_depth = props.get("rr_depth", 5)
+        self.rr_depth = min(props.get("rr_depth", 5), paths.NO_LIMIT)
         self.hide = props.get("hide_emitters", False)
         self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
         self._check(self.rr_depth >= 1, f"rr_depth is {self.rr_depth}; it must be at least 1")

@@ -108,6 +108,10 @@ def test_batch_and_irradiance_meter(name):
         return wall((x, -0.99, 0.5), (1, 0, 0), -90, 0.1, bsdf=grey(0.0), sensor=sensor)
 
     scene = room(sensor=None, a=meter(-0.5, 4), b=meter(0.5, 5))
+    if name != "plain_path":  # whose plan looks at two lamps
+        second = wall((0.5, 0.9, 0), (1, 0, 0), 90, 0.1, emitter={"type": "area"})
+        made = mi.load_dict(INTEGRATORS[name]).make_plan(room(sensor=None, a=meter(-0.5, 4), second=second))
+        assert "chosen uniformly" in made.decisions["light_sampler"].because
     for k in range(2):
         agree(name, images(scene, INTEGRATORS[name], k, 4096), images(scene, {"type": "path"}, k, 4096, first=100))
     view = {k: v for k, v in camera().items() if k != "film"}
