@@ -18,6 +18,7 @@ from mi_neural.integrators.checks import (
 )
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
+from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
 from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.media import Media
@@ -46,7 +47,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
         super().__init__(props.props)
         self.plugin = props.plugin_name()
         self.max_depth = props.get("max_depth", -1)
-        self.rr_depth = props.get("rr_depth", 5)
+        self.rr_depth = min(props.get("rr_depth", 5), paths.NO_LIMIT)
         self.hide = props.get("hide_emitters", False)
         self._check(self.max_depth >= -1, f"max_depth is {self.max_depth}; give -1 (no limit), 0, or a positive number")
         self._check(self.rr_depth >= 1, f"rr_depth is {self.rr_depth}; it must be at least 1")
@@ -87,13 +88,16 @@ class FilmIntegrator(mi.SamplingIntegrator):
         """
         raise NotImplementedError(f"{type(self).__name__} must define estimate()")
 
-    def bind_media(self, scene, sensor, known: bool) -> None:
-        """Look for media in a scene, which is `known` or another one, and where the camera is in one."""
-        medium = sensor.get_medium() if hasattr(sensor, "get_medium") else None
-        if not known or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
-            self.film_state.forget_scene()
+    def bind_media(self, scene, sensor, bound: BoundScene) -> None:
+        """Look for media in a scene, that of `bound`, where it is another one, and where the camera is in one."""
+        medium, state = sensor.get_medium() if hasattr(sensor, "get_medium") else None, self.film_state
+        of_another = state.media_of is None or state.media_of is not bound.parts
+        if of_another or (medium is not None and (self.media is None or medium.ptr not in self.media.media)):
+            state.media_of = None  # what is refused, or interrupted, is looked at anew the next time
+            state.forget_scene()
             self.media = Media.of(scene, [sensor])
             check_phase_functions(scene, sensor, self.plugin)
+            state.media_of = bound.parts
         elif self.media is not None and self.media.edited():
             self.film_state.forget_scene()
         if self.media is None:
@@ -214,7 +218,7 @@ class FilmIntegrator(mi.SamplingIntegrator):
             self.bound_lights, self.bound_field, samples, sizes, [dr.opaque(mi.Float, v) for v in settings],
             record=self.records and not is_recording() and self.film_state.scene_records(scene), sums=sums,
         )  # fmt: skip
-        self.film_state.count(n_bad)
+        self.film_state.nonfinite.add(n_bad)
         return place, values
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -243,6 +247,25 @@ class FilmIntegrator(mi.SamplingIntegrator):
                 for c in ("RGB" if self.CHANNELS[n] == 3 else " ")]  # fmt: skip
 
 
+class Nonfinite:
+    """How many samples were not finite. They are read when the number is asked for: no pass is waited for."""
+
+    def __init__(self):
+        self.counts: list = []
+
+    def add(self, n_bad) -> None:
+        """Take in how many samples of a pass were not finite."""
+        if is_recording():
+            return
+        self.counts.append(n_bad)
+        if len(self.counts) > 256:
+            self.counts = [sum(self.counts[1:], self.counts[0])]
+            dr.eval(self.counts)
+
+    def __int__(self):
+        return sum(int(n[0]) for n in self.counts)
+
+
 class _FilmState:
     """What rendering changes. Apart, because a recorded function is made anew whenever an attribute of the integrator
     that it belongs to changes; this object it takes as a whole."""
@@ -251,8 +274,9 @@ class _FilmState:
         self.passes = Passes()
         self.planned_spp: int | None = None
         self.placed: tuple[int, int] | None = None  # see place_samples()
-        self.nonfinite: list = []
+        self.nonfinite = Nonfinite()
         self.n_bound = self.n_forgotten = 0
+        self.media_of: tuple | None = None  # the parts of the scene whose media are bound
         self.said: set[str] = set()
         self.entered = False  # whether Mitsuba's own render() is under way, which calls sample()
         self._estimate = None
@@ -283,17 +307,8 @@ class _FilmState:
         self._records = None
         self.n_forgotten += 1
 
-    def count(self, n_bad) -> None:
-        """Take in how many samples of a pass were not finite."""
-        if is_recording():
-            return
-        self.nonfinite.append(n_bad)
-        if len(self.nonfinite) > 256:
-            self.nonfinite = [sum(self.nonfinite[1:], self.nonfinite[0])]
-            dr.eval(self.nonfinite)
-
     def statistics(self) -> dict:
-        s = {"nonfinite": sum(int(n[0]) for n in self.nonfinite)}
+        s = {"nonfinite": int(self.nonfinite)}
         if self._records is False:
             s["recorded"] = False
         return s

@@ -152,8 +152,10 @@ def _free_memory() -> int | None:
 
 def sensor_of(scene, sensor, plugin: str):
     """The sensor of that number, or the sensor given. Raises ValueError where there is none."""
-    if not isinstance(sensor, int):
+    if isinstance(sensor, mi.Sensor):
         return sensor
+    if not hasattr(sensor, "__index__"):
+        raise ValueError(f"{plugin}: sensor is {sensor!r}; give its number in the scene, or a sensor")
     if not scene.sensors():
         raise ValueError(
             f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>, or give one to "

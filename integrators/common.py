@@ -15,12 +15,13 @@ from mi_neural import plan
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.files import damaged
 from mi_neural.integrators import gradients, planning
+from mi_neural.integrators.base import Nonfinite
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.learning import LearningIntegrator
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
-from mi_neural.render.frozen import undisturbed
+from mi_neural.render.frozen import locked, undisturbed
 from mi_neural.render.sampling import PathSampler
 
 #: Frames that `train_frames = -1` trains at least and at most.
@@ -63,6 +64,7 @@ class _State:
         self.images = 0
         self.queries = 0.0
         self.image_open = False
+        self.begun = False  # whether the training before the first image was begun, and interrupted
         self.hurried = False  # whether the time for training was too short for a cache that is of use
 
 
@@ -114,8 +116,9 @@ class CacheIntegrator(LearningIntegrator):
         return 0.0
 
     def follow(self, other: CacheIntegrator, scene, sensor) -> None:
-        """Render with what `other` has bound, whose cache this integrator was given, and train nothing."""
-        self.state.lights = other.bound_lights
+        """Render with what `other` has bound, whose cache this integrator was given, and train nothing. `other` counts
+        the samples that are not finite."""
+        self.state.lights, self.film_state.nonfinite = other.bound_lights, other.film_state.nonfinite
         if not self.state.measured:
             self.measure_scene(scene, self._view(sensor))
 
@@ -144,7 +147,7 @@ class CacheIntegrator(LearningIntegrator):
         """Forget what was learned; the next image trains anew. Compiled kernels are kept."""
         self.cache.reset()
         self.state.reset()
-        self.film_state.nonfinite = []
+        self.film_state.nonfinite = Nonfinite()
         if self.light_sampler is not None:
             self.light_sampler.reset()
 
@@ -158,14 +161,15 @@ class CacheIntegrator(LearningIntegrator):
     def bind(self, scene, sensor, train: bool = True) -> None:
         """See that there is a cache of this scene, trained as far as the keys say."""
         view = self._view(sensor)
-        known, same = self.state.bound.parts, self.state.bound.knows(scene)
-        if self.state.bound.changed(scene) or self.state.signature is None:
+        known, signature = self.state.bound.parts, self.state.signature
+        if self.state.bound.changed(scene) or signature is None:
             try:
                 self._begin(scene, known is not self.state.bound.parts)
                 if self.state.plan is None or known is not self.state.bound.parts:
                     planning.follow(self, planning.make_plan(self, scene, view))
-            except ValueError:
-                self.state.bound.parts = known
+            except BaseException:  # Ctrl-C, too: what was begun is begun anew with the next image, whatever its scene
+                refused = self.state.signature == signature
+                self.state.bound.parts, self.state.signature = (known, signature) if refused else (None, None)
                 raise
         if self.light_sampler is not None:
             # Settings are measured with lights chosen as they will be; an image rendered in several calls is one frame
@@ -173,7 +177,7 @@ class CacheIntegrator(LearningIntegrator):
             with dr.suspend_grad():
                 self.state.lights = self.light_sampler.lights(scene, view, train=learn)
         if self.renders_media:
-            self.bind_media(scene, sensor, same)
+            self.bind_media(scene, sensor, self.state.bound)
         self.cache.recordable = self.film_state.scene_records(scene)
         if not self.needs_cache:
             if not self.state.measured:
@@ -187,7 +191,7 @@ class CacheIntegrator(LearningIntegrator):
                 with dr.suspend_grad():
                     self.measure_scene(scene, view)
             if train and not self.freeze_cache and not self.state.image_open:
-                if self.state.images == 0 and self.cache.steps == 0:
+                if self.state.images == 0 and (self.cache.steps == 0 or self.state.begun):
                     self._train_first(scene, view)
                 else:
                     self.cache.train(scene, view, self.state.lights, frames=self.train_steps)
@@ -214,7 +218,7 @@ class CacheIntegrator(LearningIntegrator):
         """What will be built in `scene`, what is left out, and why. Changes nothing."""
         sensor = self._sensor(scene, sensor)
         check_scene(scene, self.plugin, self.renders_media)
-        return planning.make_plan(self, scene, sensor)
+        return planning.make_plan(self, scene, self._view(sensor))
 
     def _publish(self) -> None:
         """Show Dr.Jit the cache as an attribute, once it no longer changes: then a function of the user's that renders
@@ -223,22 +227,27 @@ class CacheIntegrator(LearningIntegrator):
 
     def _view(self, sensor):
         """What is learned with in the place of `sensor`: other rays of it each time, where it cannot be recorded."""
-        return recordable(sensor, self.seed * 0x9E3779B9 + self.cache.steps)
+        return recordable(sensor, self.cache.seed * 0x9E3779B9 + self.cache.steps)
 
     def _train_first(self, scene, view, progress=None) -> None:
-        auto = self.train_frames < 0
-        self.cache.train(scene, view, self.state.lights, frames=None if auto else self.train_frames,
-                         at_least=SETTLE_FRAMES[0], at_most=SETTLE_FRAMES[1], progress=progress)  # fmt: skip
+        auto, done, self.state.begun = self.train_frames < 0, self.cache.steps, True
+        frames, least, most = (max(0, n - done) for n in (self.train_frames, *SETTLE_FRAMES))
+        self.cache.train(scene, view, self.state.lights, frames=None if auto else frames, at_least=least, at_most=most,
+                         progress=progress)  # fmt: skip
+        self.state.begun = False
 
+    @locked
     def train_first(self, scene, sensor=0, progress=None) -> dict:
-        """Train now as the first image would (`train_frames`), if nothing was learned yet. Returns the statistics."""
+        """Train now as the first image would (`train_frames`), if nothing was learned yet, or go on where that was
+        interrupted. Returns the statistics."""
         sensor = self._sensor(scene, sensor)
         self.bind(scene, sensor, train=False)
-        if self.needs_cache and not self.freeze_cache and self.cache.steps == 0:
+        if self.needs_cache and not self.freeze_cache and (self.cache.steps == 0 or self.state.begun):
             self._train_first(scene, self._view(sensor), progress)
         self._publish()
         return self.statistics()
 
+    @locked
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train `frames` frames now. `progress` is called with (done, total). Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
@@ -248,6 +257,7 @@ class CacheIntegrator(LearningIntegrator):
         self._publish()
         return self.statistics()
 
+    @locked
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
         """Train for about `seconds` of wall time. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
@@ -277,6 +287,7 @@ class CacheIntegrator(LearningIntegrator):
         finally:
             self.state.images, self.state.queries, self.state.image_open = known
 
+    @locked
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. What was learned so far stays as it is."""
         sensor = self._sensor(scene, sensor)
@@ -284,22 +295,23 @@ class CacheIntegrator(LearningIntegrator):
         untouched = self.cache.field is None
         known_lights = self.light_sampler is not None and self.light_sampler.statistics().get("visibility_steps")
         self.bind(scene, sensor, train=False)
-        if self.needs_cache:
-            state = None if untouched else self.cache.checkpoint()
-            if not self.freeze_cache:
+        state = self.cache.checkpoint() if self.needs_cache and not untouched else None
+        try:
+            if self.needs_cache and not self.freeze_cache:
                 for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
                     self.cache.train_frame(scene, self._view(sensor), self.state.lights)
-        with dr.suspend_grad():
-            for _ in range(2):
-                dr.eval(self._render(scene, sensor, 1, spp))
-        dr.sync_thread()
-        if self.needs_cache:
-            if math.isnan(self.state.ns_per_query):
+            with dr.suspend_grad():
+                for _ in range(2):
+                    dr.eval(self._render(scene, sensor, 1, spp))
+            dr.sync_thread()
+            if self.needs_cache and math.isnan(self.state.ns_per_query):
                 self.measure_query()
-            self.cache.rollback(state)
-        self.state.images, self.state.queries = images, queries
-        if self.light_sampler is not None and not known_lights:
-            self.light_sampler.reset()
+        finally:
+            if self.needs_cache:
+                self.cache.rollback(state)
+            self.state.images, self.state.queries = images, queries
+            if self.light_sampler is not None and not known_lights:
+                self.light_sampler.reset()
 
     def statistics(self) -> dict:
         """Facts since the last reset: training (see :class:`IncidentCache`), queries, non-finite samples."""
@@ -323,6 +335,7 @@ class CacheIntegrator(LearningIntegrator):
             s["ns_per_query"] = self.state.ns_per_query
         return s
 
+    @locked
     def measure_query(self, n: int = 2**16) -> float:
         """Nanoseconds per cache query, as :meth:`probe` asks it. Also kept for :meth:`statistics`."""
         field = self.cache.queried
@@ -399,7 +412,7 @@ class CacheIntegrator(LearningIntegrator):
             self.cache.resume(field, header, extra)
         except (KeyError, TypeError, ValueError) as e:
             raise damaged(path, e) from None
-        self.state.loaded = (path, header.get("scene"))
+        self.state.loaded, self.state.begun = (path, header.get("scene")), False
         if field.shape != self.cache.shape:
             self.cache.shape = field.shape
             self.cache.clear_recordings()

@@ -14,8 +14,9 @@ LIGHT_SAMPLER_KEY = """
 """
 
 
-#: Keys of whole numbers that have no default of their own.
+#: Keys of whole numbers, and of others, that have no default of their own.
 WHOLE = ("levels", "hashmap_size", "width", "hidden_layers", "cache_samples", "residual_samples", "train_records")
+NUMBERS = ("residual_probability", "roulette", "guide")
 
 
 class Keys:
@@ -34,13 +35,13 @@ class Keys:
 
     def get(self, name: str, default):
         value = self.props.get(name, self.preset.get(name, default))
-        if name in WHOLE and default is None and value is not None:
-            default = 0
+        if default is None and value is not None:
+            default = 0 if name in WHOLE else 0.0 if name in NUMBERS else None
         if isinstance(default, bool):
             self._check(isinstance(value, bool), name, value, "true or false")
         elif isinstance(default, int):
-            whole = isinstance(value, int | float) and not isinstance(value, bool) and value == int(value)
-            self._check(whole, name, value, "a whole number")
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            self._check(number and float(value).is_integer(), name, value, "a whole number")
             value = int(value)
         elif isinstance(default, float):
             self._check(isinstance(value, int | float) and not isinstance(value, bool), name, value, "a number")

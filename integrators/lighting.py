@@ -5,13 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_neural.integrators.base import FilmIntegrator
+from mi_neural.integrators.base import FilmIntegrator, Nonfinite
 from mi_neural.integrators.checks import check_scene, sensor_of
 from mi_neural.integrators.gradients import moved, name_black_lamps
 from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import recordable
-from mi_neural.render.frozen import LOCK
+from mi_neural.render.frozen import LOCK, locked
 
 
 def light_sampler_of(props):
@@ -101,6 +101,7 @@ class LightSamplingIntegrator(FilmIntegrator):
     def reset(self) -> None:
         """Forget what was learned. Compiled kernels are kept."""
         self.lights = None
+        self.film_state.nonfinite = Nonfinite()
         if self.light_sampler is not None:
             self.light_sampler.reset()
 
@@ -110,6 +111,7 @@ class LightSamplingIntegrator(FilmIntegrator):
             self.light_sampler.reseed(seed)
         self.reset()
 
+    @locked
     def train(self, scene, frames: int, sensor=0, progress=None) -> dict:
         """Train the light sampler for so many frames. `progress` is called with (done, total). Returns `statistics`."""
         sensor = sensor_of(scene, sensor, self.plugin)
@@ -119,16 +121,24 @@ class LightSamplingIntegrator(FilmIntegrator):
                 progress(k + 1, frames)
         return self.statistics()
 
+    @locked
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. A cache without training records is left unchanged."""
         sensor = sensor_of(scene, sensor, self.plugin)
-        fresh = not self.statistics().get("visibility_steps")
-        with dr.suspend_grad():
-            for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
-                dr.eval(self.render(scene, sensor, 0, spp))
-        dr.sync_thread()
-        if fresh:
-            self.reset()
+        fresh = self.untrained
+        try:
+            with dr.suspend_grad():
+                for _ in range(3):  # the first recordings of a frozen function differ from what it then replays
+                    dr.eval(self.render(scene, sensor, 0, spp))
+            dr.sync_thread()
+        finally:
+            if fresh:
+                self.reset()
+
+    @property
+    def untrained(self) -> bool:
+        """Whether nothing has been learned."""
+        return not self.statistics().get("visibility_steps")
 
     def statistics(self) -> dict:
         """Facts since the last reset: what the light sampler says of itself."""

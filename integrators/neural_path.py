@@ -15,6 +15,7 @@ from mi_neural.estimators.spread import grown
 from mi_neural.integrators.keys import SHARED_KEYS, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix
+from mi_neural.render.frozen import locked
 from mi_neural.render.kernels import end_kernel
 from mi_neural.render.surface import scene_is_glossy
 
@@ -76,6 +77,7 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         """Whether images are traced without the cache, which had no time to learn."""
         return self.state.hurried and self.cache.steps < LEAST_STEPS
 
+    @locked
     def train_seconds(self, scene, seconds: float, sensor=0, progress=None) -> dict:
         """Train for about `seconds` of wall time, longer by a factor of `LONGER` if `LEAST_STEPS` take that long. A
         cache that can not have them stays out of images until it has. Returns :meth:`statistics`."""

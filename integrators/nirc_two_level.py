@@ -22,6 +22,8 @@ from mi_neural.integrators.progressive import UNBIASED, Parts
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.ends import Ends
+from mi_neural.render.film import Area
+from mi_neural.render.frozen import locked
 
 MODES = ("unbiased", "progressive")
 #: Queries per vertex with `every_vertex`: the direction that is followed, and another.
@@ -108,6 +110,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         self._check(field.shape == self.cache.shape, f"its cache is of {field.shape}, this one of {self.cache.shape}; "
                     "give both the same sizes")  # fmt: skip
         self.cache.adopt(field)
+        self.state.begun = False
         self.choice.reset()
 
     def load_cache(self, path, scene=None) -> None:
@@ -129,9 +132,10 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
             return
         with dr.suspend_grad():
             self.choice.know_alpha(self, scene, sensor, self.split.alpha < 0)
-            if self.mixed is None and (self.choice.rendered >= pilot.WORTH or self.compiling):
+            if self.mixed is None and (self.choice.rendered + self.choice.under_way >= pilot.WORTH or self.compiling):
                 self.choice.measure(self, scene, sensor)
 
+    @locked
     def measure(self, scene, sensor=0) -> dict:
         """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
@@ -143,14 +147,18 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """One image: train as the keys say, then render `spp` samples a pixel (0: the sampler's own count)."""
-        sensor = self._sensor(scene, sensor)
-        size, expected = sensor.film().crop_size(), self.planned_spp or spp or sensor.sampler().sample_count()
-        before, pixels = self.choice.rendered, int(size[0]) * int(size[1])
-        self.choice.rendered += expected * pixels
-        result = super().render(scene, sensor, seed, spp, develop, evaluate)
-        self.choice.rendered = before + (spp or sensor.sampler().sample_count()) * pixels
-        return result
+        sensor = self._checked(scene, sensor, spp)
+        spp = spp or sensor.sampler().sample_count()
+        pixels = Area.of(sensor).n_pixels
+        self.choice.under_way = (self.planned_spp or spp) * pixels
+        try:
+            image = super().render(scene, sensor, seed, spp, develop, evaluate)
+        finally:
+            self.choice.under_way = 0
+        self.choice.rendered += spp * pixels
+        return image
 
+    @locked
     def prepare(self, scene, sensor=0, spp: int = 1) -> None:
         """Compile all that a render call with `spp` needs. What was learned and measured so far stays as it is."""
         known, self.compiling = self.choice.state(), True
@@ -302,9 +310,9 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         cancels = two_level.residual(mi.Color3f(0), followed, α, q, kept)
         return two_level.combine(followed + other, mi.Float(INNER), cancels, 1, α), sampler
 
-    def incident_radiance(self, scene, field, path, found, after, sampler):
+    def incident_radiance(self, scene, lights, field, path, found, after, sampler):
         field = field.field if isinstance(field, Foreseen) else field
-        return super().incident_radiance(scene, field, path, found, after, sampler)
+        return super().incident_radiance(scene, lights, field, path, found, after, sampler)
 
     def to_string(self):
         return (

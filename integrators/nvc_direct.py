@@ -243,10 +243,9 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
 
     def reset(self) -> None:
         """Forget what was learned; the next image trains anew."""
-        self.light_sampler.reset()
+        super().reset()
         self.cache.reset()
         self.bound = BoundScene()
-        self.lights = None  # what chooses lights; None: the scene itself
         self.unshadowed: UnshadowedLights | None = None
         self.only_light: VisibilityCache | None = None  # of a single light, which no light sampler learns
         self.mixed = True  # whether materials have mirror lobes beside others
@@ -257,10 +256,18 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
 
     def statistics(self) -> dict:
         """Facts since the last reset."""
-        facts = dict(self.light_sampler.statistics())
+        facts = super().statistics()
         if self.only_light is not None:
             facts |= {"lights": 1, "light_groups": 1} | self.only_light.statistics
-        return facts | (self.cache.statistics if self.kind == "radiance" else {})
+            facts["seconds_train"] = facts["seconds_visibility"]
+        if self.kind == "radiance":
+            facts |= self.cache.statistics
+            facts["seconds_train"] += facts["seconds_direct"]
+        return facts
+
+    @property
+    def untrained(self) -> bool:
+        return super().untrained and not self.cache.steps
 
     def bind(self, scene, sensor, train: bool = True) -> None:
         """Train as the keys say, and have all ready for an image of `scene` as it is now."""
@@ -311,7 +318,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         self._check(getattr(settings, "cache", None) is not None, "one light needs nvc_lights as light_sampler")
         if self.only_light is None:
             known = settings.cache
-            self.only_light = VisibilityCache(known.training, seed=self.seed, grid=known.grid, he=known.he)
+            self.only_light = VisibilityCache(known.training, seed=self.cache.seed, grid=known.grid, he=known.he)
         steps = settings.train_steps if self.only_light.steps else settings.train_frames
         with dr.resume_grad():
             self.only_light.train(scene, sensor, table, groups, frames=steps if train and not settings.freeze else 0)
@@ -327,21 +334,27 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
         si, bsdf, active = path.si, path.si.bsdf(), path.active
 
         # Direct light at the first surface that is not a mirror
-        if self.kind == "radiance":
-            direct = albedo(si, bsdf, active) * self.cache.query(si.p) + self.mirrored(scene, si, bsdf, sampler, active)
-        elif self.mode == "neural":
-            direct = self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), active)
-            direct += self.mirrored(scene, si, bsdf, sampler, active)
+        if self.kind == "visibility" and self.mode == "sampled":
+            direct, valid = self.sampled(scene, path, sampler)
         else:
-            direct = self.sampled(scene, path, sampler)
+            if self.kind == "radiance":
+                direct = albedo(si, bsdf, active) * self.cache.query(si.p)
+            else:
+                direct = self.unshadowed.total(scene, si, bsdf, self.lights.field.query(si.p), active)
+            direct += self.mirrored(scene, si, bsdf, sampler, active)
+            holes = active & vertex.has_null(bsdf)
+            opacity = 1 - dr.mean(bsdf.eval_null_transmission(si, holes))
+            valid = dr.select(holes, opacity, dr.select(path.valid, mi.Float(1), 0))
         L = path.L + dr.select(active, path.β * direct, 0)
-        return L, path.valid, self.extra(si, bsdf, sampler, active) if self.channels else {}
+        return L, valid, self.extra(si, bsdf, sampler, active) if self.channels else {}
 
     def sampled(self, scene, path, sampler):
-        """E = ∫ f Le cos dω, by `light_samples` shadow rays and one BSDF ray."""
+        """(direct light, whether the pixel is covered): E = ∫ f Le cos dω, by `light_samples` shadow rays and one BSDF
+        ray."""
         n = self.light_samples
         direct = paths.direct_light if n == 1 else partial(paths.several_lights, n)
-        return paths.bounce(scene, self.lights, path, sampler, paths.stratified(sampler), direct=direct)[0].direct
+        found, _ = paths.bounce(scene, self.lights, path, sampler, paths.stratified(sampler), direct=direct)
+        return found.direct, paths.advance(path, found).valid
 
     def mirrored(self, scene, si, bsdf, sampler, active):
         """Emission that the mirror lobes of a material with others beside show."""

@@ -89,13 +89,13 @@ class OutgoingIntegrator(CacheIntegrator):
                 message = message.replace(f"{name} is", f"{key} is")
             raise ValueError(f"{self.plugin}: {message}") from None
 
-    def bind_media(self, scene, sensor, known: bool) -> None:
+    def bind_media(self, scene, sensor, bound) -> None:
         known_media, known_camera, forgotten = self.media, self.camera_medium_id, self.film_state.n_forgotten
-        super().bind_media(scene, sensor, known)
+        super().bind_media(scene, sensor, bound)
+        self._check(self.media is None or self.cache.training.roughening == 0,
+                    "roughening works in scenes without participating media; leave it out")  # fmt: skip
         another = self.media is not known_media or self.camera_medium_id != known_camera
         if another or (self.media is not None and self.film_state.n_forgotten > forgotten):
-            self._check(self.media is None or self.cache.training.roughening == 0,
-                        "roughening works in scenes without participating media; leave it out")  # fmt: skip
             self.walk = SURFACES if self.media is None else MediaWalk(self.media, self.camera_medium)
             share = self.outgoing_keys["unbounded_share"] if self.media is None else self.unbounded_in_media
             self.cache.training = replace(self.cache.training, unbounded_share=share)

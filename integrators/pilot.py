@@ -71,6 +71,9 @@ class Choice:
     Raises ValueError for keys out of range.
     """
 
+    #: Camera samples of the image that is being rendered.
+    under_way = 0
+
     def __init__(self, cache_samples, residual_samples, residual_probability, alpha, roulette=None, guide=None):
         if cache_samples is not None and cache_samples < 0:
             raise ValueError(f"cache_samples is {cache_samples}; give 0 (path tracing) or more")
@@ -79,10 +82,9 @@ class Choice:
                              "residual_probability")  # fmt: skip
         if residual_probability is not None and not 0 < residual_probability <= 1:
             raise ValueError(f"residual_probability is {residual_probability}; it must lie in (0, 1]")
-        if isinstance(alpha, str) and alpha != "cell":
-            raise ValueError(f"alpha is '{alpha}'; give 'cell' or a number in [0, 1]")
-        if alpha is not None and not isinstance(alpha, str) and not 0 <= alpha <= 1:
-            raise ValueError(f"alpha is {alpha}; give 'cell' or a number in [0, 1]")
+        number = isinstance(alpha, int | float) and not isinstance(alpha, bool) and 0 <= alpha <= 1
+        if not (number or alpha in (None, "cell")):
+            raise ValueError(f"alpha is {alpha!r}; give 'cell' or a number in [0, 1]")
         if roulette is not None and not (0 <= roulette < math.inf):
             raise ValueError(f"roulette is {roulette}; give 0 (by throughput) or a positive number")
         if guide is not None and not (0 <= guide < 1):
@@ -121,7 +123,7 @@ class Choice:
 
     def look_ahead(self, integrator, scene, sensor, anew: bool = False) -> None:
         """See that there is an outlook, with a guide if the division has one."""
-        given = scene, integrator._view(sensor), integrator.bound_lights, integrator.seed ^ 0x6F75746C
+        given = scene, integrator._view(sensor), integrator.bound_lights, integrator.cache.seed ^ 0x6F75746C
         if self.outlook is None or anew:
             self.outlook = Outlook.learn(*given)
         if self.split.guide > 0:
@@ -135,7 +137,7 @@ class Choice:
         self.split = Split(**known)
         self.table: list[dict] = []
         self.measured_at = -1
-        self.rendered = 0  # camera samples, those of the image under way included
+        self.rendered = 0  # camera samples of finished images
         self.seconds = 0.0
 
     def split_into(self, n_traced: int) -> None:
@@ -177,11 +179,15 @@ class Choice:
         steps = integrator.cache.steps
         if self.measured_at >= 0 and steps < 2 * max(self.measured_at, 1):
             return
-        start = time.perf_counter()
+        start, before = time.perf_counter(), self.state()
         self.measured_at = steps
-        if not self.fixed:
-            self.know_alpha(integrator, scene, sensor, self.given["alpha"] in (None, BY_PLACE))
-            self._compare(Pilot(integrator, scene, sensor))
+        try:
+            if not self.fixed:
+                self.know_alpha(integrator, scene, sensor, self.given["alpha"] in (None, BY_PLACE))
+                self._compare(Pilot(integrator, scene, sensor))
+        except BaseException:  # Ctrl-C: what stands then is a candidate, chosen by nothing
+            self.restore(before)
+            raise
         dr.sync_thread()
         self.seconds += time.perf_counter() - start
 

@@ -85,9 +85,8 @@ class PlainPathIntegrator(LightSamplingIntegrator):
             raise ValueError("plain_path: neural_depth needs an nvc_lights with visibility=true as light_sampler")
 
     def bind(self, scene, sensor, train: bool = True) -> None:
-        known = self.bound.knows(scene)
         super().bind(scene, sensor, train)
-        self.bind_media(scene, sensor, known)
+        self.bind_media(scene, sensor, self.bound)
         if self.media is not None and self.neural_depth >= 0:
             raise ValueError("plain_path: neural_depth works in scenes without participating media; leave it out")
         if self.neural_depth < 0 or self.lights is None:  # a single light is traced as ever

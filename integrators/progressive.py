@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_neural.estimators.combine import correction, scale_of, share_of_noise, trimmed_mean
+from mi_neural.render.film import Area, kind_of
 
 #: Channels that the parts of an image must have.
 BIASED, UNBIASED = ("cache", "residual"), ("cache", "residual", "variance_cache", "variance_residual",
@@ -194,7 +195,9 @@ class Mixed:
                 self.unbiased.add(Parts.of(block, self.integrator.inner_channels, self.integrator))
                 self.n_unbiased += n
             else:
+                queries = nirc.state.queries
                 block = Parts.of(nirc.render_block(scene, sensor, seed, n), BIASED, nirc)
+                self.integrator.state.queries += nirc.state.queries - queries
                 self.biased.add(block)
                 self.squares = self.squares + n * np.square(block.indirect)
                 self.n_biased, self.n_blocks = self.n_biased + n, self.n_blocks + 1
@@ -207,11 +210,11 @@ class Mixed:
 
     def compile(self, scene, sensor, seed: int, spp: int, render) -> None:
         """Compile what images of one call or several calls of `spp` samples need; ``render(seed, spp)`` as above."""
-        nirc, size = self.nirc, tuple(int(v) for v in sensor.film().crop_size())
+        nirc = self.nirc
         self._measure_scene(scene, sensor)
         sizes = pieces(spp, max(power_of_four(spp / BLOCKS), 1)) + pieces(spp, power_of_four(spp))
         for n in sorted(set(sizes)):
-            key = id(scene), id(sensor), size, n
+            key = kind_of(sensor), Area.of(sensor), n
             if key not in self.compiled:
                 for _ in range(2):  # the first recording of a frozen function differs from what it then replays
                     dr.eval(nirc.render_block(scene, sensor, seed, n).tensor(), render(seed, n).tensor())
@@ -244,7 +247,9 @@ class Mixed:
         n_light = self.nirc.n_light * self.n_biased, self.integrator.split.n_traced * self.n_unbiased
         if self.n_unbiased == 0:
             out.add(self.biased)
-            out.channels = {k: 0 * self.biased.rgb for k in self.integrator.inner_channels} | out.channels
+            sizes = self.integrator.CHANNELS
+            missing = {k: 0 * self.biased.rgb[..., : sizes[k]] for k in self.integrator.inner_channels}
+            out.channels = missing | out.channels
             return out
         out.add(self.unbiased)
         if self.n_biased == 0:

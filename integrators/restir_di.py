@@ -1,5 +1,7 @@
 """``restir_di``: direct light by reuse of light samples over pixels and frames."""
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -7,7 +9,7 @@ import numpy as np
 from mi_neural.caches import presets
 from mi_neural.integrators import restir_reuse as reuse
 from mi_neural.integrators import restir_samples as samples
-from mi_neural.integrators.base import refuse_gradients
+from mi_neural.integrators.base import Nonfinite, refuse_gradients
 from mi_neural.integrators.checks import check_film, check_scene, check_spp, refuse_medium_of, sensor_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
@@ -43,6 +45,7 @@ class _State:
         self.past_power: PowerLights | None = None
         self.past_camera: tuple | None = None
         self.frame = 0
+        self.nonfinite = Nonfinite()
 
 
 class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
@@ -184,7 +187,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         self._check(self.spatial_samples >= 0,
                     f"spatial_samples is {self.spatial_samples}; give 0 (no reuse over pixels) or more")  # fmt: skip
         self._check(
-            self.spatial_radius > 0 or self.spatial_radius == -1,
+            0 < self.spatial_radius < math.inf or self.spatial_radius == -1,
             f"spatial_radius is {self.spatial_radius}; give -1 (by the film) or a number greater than 0",
         )
         self._check(-1 <= self.normal_threshold <= 1,
@@ -250,6 +253,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             check_scene(scene, "restir_di")
             s.reset()
             s.frames.clear()
+            s.power = None  # it has the lights of the scene before
             s.key, s.freeze = key, can_freeze_scene(scene)
 
         lights, facts = self._lights(scene, recordable(sensor, s.frame))
@@ -268,10 +272,11 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
         frame = self._frame_of(area, pinhole)
         if s.freeze and facts not in s.frames:
             s.frames[facts] = dr.freeze(frame, auto_opaque=False)
-        pos, values, s.past = call(
+        pos, values, s.past, n_bad = call(
             s.frames, facts, frame, scene, sensor if rays is None else None, rays, lights, s.power, s.past_power,
             s.past, s.past_camera, *numbers,
         )  # fmt: skip
+        s.nonfinite.add(n_bad)
         s.past_power, s.past_camera = s.power, camera
         s.frame += 1
         return pos, values
@@ -340,12 +345,12 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             L = dr.select(ok, L, 0)
             values = [L.x, L.y, L.z]
             if self.state.alpha:
-                values.append(coverage(valid))
+                values.append(dr.select(ok, coverage(valid), 0))
             values.append(dr.select(ok, mi.Float(1), 0))
             pos = (area.corner(pixel) + 0.5 if area.box else pos) + mi.Point2f(mi.ScalarPoint2f(area.offset))
             past = Past(kept, si, usable)
-            dr.eval(pos, values, past)
-            return pos, values, past
+            dr.eval(pos, values, past, ok)
+            return pos, values, past, dr.count(~ok)
 
         return render_frame
 
@@ -376,9 +381,11 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     plugin = "restir_di"
 
     def statistics(self) -> dict:
-        """Facts since the last reset: frames, and what the light sampler says of itself."""
-        chooser = self.state.chooser
-        return {"frames": self.state.frame, **(chooser.statistics() if chooser is not None else {})}
+        """Facts since the last reset: frames, samples that were not finite, and what the light sampler says of itself.
+        """
+        facts = {} if self.state.chooser is None else self.state.chooser.statistics()
+        return {"frames": self.state.frame, "nonfinite": int(self.state.nonfinite),
+                "seconds_train": facts.get("seconds_visibility", 0.0), **facts}  # fmt: skip
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         raise RuntimeError("restir_di renders whole frames and cannot be nested in another integrator; use plain_path")

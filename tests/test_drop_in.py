@@ -5,6 +5,7 @@ for 8 % of bias: a false alarm in about 10,000 choices of seed.
 """
 
 import gc
+import math
 import re
 import resource
 import threading
@@ -107,6 +108,10 @@ def test_batch_and_irradiance_meter(name):
         return wall((x, -0.99, 0.5), (1, 0, 0), -90, 0.1, bsdf=grey(0.0), sensor=sensor)
 
     scene = room(sensor=None, a=meter(-0.5, 4), b=meter(0.5, 5))
+    if name != "plain_path":  # whose plan looks at two lamps
+        second = wall((0.5, 0.9, 0), (1, 0, 0), 90, 0.1, emitter={"type": "area"})
+        made = mi.load_dict(INTEGRATORS[name]).make_plan(room(sensor=None, a=meter(-0.5, 4), second=second))
+        assert "chosen uniformly" in made.decisions["light_sampler"].because
     for k in range(2):
         agree(name, images(scene, INTEGRATORS[name], k, 4096), images(scene, {"type": "path"}, k, 4096, first=100))
     view = {k: v for k, v in camera().items() if k != "film"}
@@ -404,10 +409,28 @@ def test_gradients_are_refused_in_one_line(name):
 @pytest.mark.parametrize("keys", [
     {"type": "nirc", "cache_samples": 1.5}, {"type": "nrc", "train_frames": 2.5},
     {"type": "plain_path", "max_depth": 3.2}, {"type": "nirc", "levels": 1.5},
+    {"type": "plain_path", "max_depth": math.inf}, {"type": "nirc", "rr_depth": math.nan},
 ])  # fmt: skip
 def test_numbers_that_must_be_whole_are_refused_otherwise(keys):
     with pytest.raises((ValueError, RuntimeError), match="give a whole number"):
         mi.load_dict(keys)
+
+
+@pytest.mark.parametrize("keys", [{"residual_probability": "half"}, {"roulette": True}, {"guide": "on"},
+                                  {"alpha": True}])  # fmt: skip
+def test_keys_without_a_default_are_refused_by_name_too(keys):
+    with pytest.raises((ValueError, RuntimeError), match=rf"nirc_two_level: {next(iter(keys))} is .*; give .*number"):
+        mi.load_dict({"type": "nirc_two_level", **keys})
+
+
+@ALL
+def test_what_is_no_sensor_or_no_sample_count_is_refused_in_one_line(name):
+    scene, integrator = room(), mi.load_dict(INTEGRATORS[name])
+    with pytest.raises(ValueError, match=f"{name}: sensor is 'x'; give its number"):
+        integrator.render(scene, sensor="x", spp=1)
+    for spp in ("8", 1.5, -1):
+        with pytest.raises(ValueError, match=f"{name}: spp is {spp!r}; give a whole number"):
+            integrator.render(scene, spp=spp)
 
 
 def test_last_line_of_an_error_inside_render_is_ours(run_python):

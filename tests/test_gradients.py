@@ -113,12 +113,12 @@ def train(scene, name, **keys):
 # ---------------------------------------------------------------- what is known
 
 
-@pytest.mark.parametrize("name", CACHED)
-def test_gradients_of_the_point_lit_sphere(name):
+@pytest.mark.parametrize("name, keys", [*((name, {}) for name in CACHED), ("nirc_two_level", {"gradient": "cache"})])
+def test_gradients_of_the_point_lit_sphere(name, keys):
     """Albedo ρ, intensity I: L = I/π ρ/(1 - ρ) everywhere, so dL/dρ = 4 and dL/dI = 1/π at 1/2 and π."""
     scene = mi.load_file(str(scenes.path("point_lit_sphere")), resx=8, resy=8)
     params, (wall_key, light_key) = tracked(scene)
-    integrator = mi.load_dict({"type": name, "train_frames": 48, "train_samples": 512})
+    integrator = mi.load_dict({"type": name, "train_frames": 48, "train_samples": 512, **keys})
     image = mi.render(scene, params, integrator=integrator, spp=64, seed=1)
     steps = integrator.cache.steps
     dr.backward(dr.mean(image, axis=None))

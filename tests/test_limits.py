@@ -192,6 +192,51 @@ def test_integrator_goes_on_after_ctrl_c_while_it_was_recorded(place, call, scen
     assert count[0] >= call and found.mean() == pytest.approx(known, rel=0.1)
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_integrator_goes_on_after_ctrl_c_while_it_planned(first):
+    """In its first scene, or in another after that."""
+    lamps, other = room()(), room(extra={"spark": None})()
+    known, integrator = mi.load_dict(ALL["nirc"]), mi.load_dict(ALL["nirc"])
+    expected = image(known, lamps)
+    if not first:
+        image(integrator, other)
+    with (interrupted_at(importlib.import_module("mi_neural.integrators.planning"), "light_noise", 1),
+          pytest.raises(KeyboardInterrupt)):  # fmt: skip
+        image(integrator, lamps)
+    found = image(integrator, lamps)
+    assert integrator.state.plan.to_json() == known.state.plan.to_json() and integrator.cache.steps == 8
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [8, -1])
+def test_first_training_goes_on_after_ctrl_c(scene, monkeypatch, frames):
+    monkeypatch.setattr(importlib.import_module("mi_neural.integrators.common"), "SETTLE_FRAMES", (8, 8))
+    integrator = mi.load_dict({**ALL["nirc"], "train_frames": frames})
+
+    def stop(done, _):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        integrator.train_first(scene, progress=stop)
+    assert integrator.cache.steps == 3
+    image(integrator, scene)
+    assert integrator.cache.steps == 8
+    image(integrator, scene)
+    assert integrator.cache.steps == 9
+
+
+@pytest.mark.parametrize("name", ["nirc", "nvc_direct"])
+def test_ctrl_c_while_it_is_prepared_leaves_no_trace(name, scene):
+    """Something was trained by then."""
+    integrator = mi.load_dict(ALL[name])
+    with (interrupted_at(importlib.import_module("mi_neural.render.film"), "_pass_of", 1),
+          pytest.raises(KeyboardInterrupt)):  # fmt: skip
+        integrator.prepare(scene)
+    facts = integrator.statistics()
+    assert facts.get("steps", 0) == 0 and facts.get("visibility_steps", 0) == 0 and facts["seconds_train"] < 1
+
+
 def test_ctrl_c_waits_for_the_end_of_what_is_recorded_and_is_not_lost():
     reached = False
     with pytest.raises(KeyboardInterrupt), undisturbed():

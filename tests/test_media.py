@@ -247,8 +247,24 @@ def test_image_without_gradients_outside_of_mi_render():
 
 def test_phase_function_of_microflakes_is_refused():
     flakes = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2, 6), np.float32))}}
-    with pytest.raises(ValueError, match=r"plain_path: .*microflakes.*volpath"):
-        mi.load_dict({"type": "plain_path"}).render(room(box=cube(fog() | {"phase": flakes})), spp=1)
+    scene, integrator = room(box=cube(fog() | {"phase": flakes})), mi.load_dict({"type": "plain_path"})
+    for _ in range(2):  # the second time, too
+        with pytest.raises(ValueError, match=r"plain_path: .*microflakes.*volpath"):
+            integrator.render(scene, spp=1)
+
+
+def test_media_are_rendered_after_ctrl_c_while_lights_were_learned(monkeypatch):
+    scene, keys = room(box=cube(fog())), {"type": "plain_path", "light_sampler": {"type": "uniform_lights"}}
+    known = np.array(mi.load_dict(keys).render(scene, spp=4))
+    integrator = mi.load_dict(keys)
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(type(integrator.light_sampler), "train", interrupted)
+        integrator.render(scene, spp=4)
+    np.testing.assert_allclose(np.array(integrator.render(scene, spp=4)), known, rtol=1e-4, atol=1e-5)
 
 
 def test_neural_depth_is_refused():

@@ -342,6 +342,30 @@ def test_emission_that_turns_into_nan_is_counted_and_stays_out_of_the_image():
     assert integrator.statistics()["nonfinite"] > 0 and image.mean() > 0.3
 
 
+@pytest.mark.parametrize("name", ["plain_path", "nvc_direct", "restir_di"])
+def test_samples_that_are_not_finite_count_neither_as_coverage(name):
+    """A lamp that is seen through holes: where a ray meets it the sample is left out, and alpha remains a share."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
+    scene = mi.load_dict({
+        "type": "scene", "sensor": {"type": "perspective", "to_world": T().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                                    "film": film},
+        "holes": {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(3),
+                  "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse"}}},
+        "lamp": {"type": "rectangle", "to_world": T().scale(0.5),
+                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}},
+        "other": {"type": "point", "position": [0, 0, 3], "intensity": 1.0},
+    })  # fmt: skip
+    integrator = mi.load_dict({"type": name})
+    mi.render(scene, integrator=integrator, spp=4)
+    params = mi.traverse(scene)
+    params["lamp.emitter.radiance.value"] = mi.Color3f(float("nan"), 0.5, 0.5)
+    params.update()
+    image = np.array(mi.render(scene, integrator=integrator, spp=64, seed=1))
+    facts = integrator.statistics()
+    assert np.isfinite(image).all() and facts["nonfinite"] > 0 and image[..., 3].max() <= 1 + 1e-6
+
+
 # ---------------------------------------------------------------- channels
 
 

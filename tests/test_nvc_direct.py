@@ -152,6 +152,34 @@ def test_noise_falls_with_shadow_rays_of_one_camera_ray(many_lights):
     assert noise[1] < 0.5 * noise[0]
 
 
+@pytest.mark.parametrize("keys", [{}, {"light_samples": 1}, {"cache": "radiance", "train_frames": 2}])
+def test_holes_cover_their_pixels_as_in_path(keys):
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
+    scene = mi.load_dict({
+        "type": "scene", "sensor": {"type": "perspective", "to_world": T().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                                    "film": film},
+        "holes": {"type": "rectangle", "to_world": T().scale(3),
+                  "bsdf": {"type": "mask", "opacity": 0.3, "bsdf": {"type": "diffuse"}}},
+        "lamp": FORMS["point"], "second": {"type": "point", "position": [0, 0, 3], "intensity": 1.0},
+    })  # fmt: skip
+    alpha = np.array(mi.load_dict({"type": "nvc_direct", **keys}).render(scene, spp=256))[..., 3]
+    path = np.array(mi.load_dict({"type": "path", "max_depth": 2}).render(scene, spp=256))[..., 3]
+    print(f"alpha {alpha.mean():.3f}, path {path.mean():.3f}")
+    assert abs(alpha.mean() - 0.3) < 0.03 and abs(path.mean() - 0.3) < 0.03  # 4 standard errors of 4,096 samples
+
+
+def test_preparing_keeps_a_radiance_cache():
+    scene = test_scene(lights("all"))
+    integrator = mi.load_dict({"type": "nvc_direct", "cache": "radiance", "train_frames": 8, "train_samples": 256,
+                               "light_sampler": {"type": "uniform_lights"}})  # fmt: skip
+    integrator.prepare(scene)
+    assert integrator.statistics()["direct_steps"] == 0
+    integrator.render(scene, spp=1)
+    integrator.prepare(scene)
+    facts = integrator.statistics()
+    assert facts["direct_steps"] >= 8 and 0 < facts["seconds_direct"] <= facts["seconds_train"]
+
+
 def test_hides_emitters_as_path_does():
     scene = test_scene(lights("area"))
     ours, path = (renders(scene, {"type": t, "max_depth": 2, "hide_emitters": True}, 16, 32, k)

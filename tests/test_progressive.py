@@ -2,6 +2,7 @@
 
 import math
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from expectation import renders
@@ -61,6 +62,15 @@ def test_mean_of_progressive_is_that_of_path_with_many_samples(bench, box, poor)
     error = math.hypot(noise / 4, known.mean(axis=(1, 2, 3)).std(ddof=1) / 8 / known.mean())
     print(f"off by {off:+.2e}, noise of one image {noise:.1e}")
     assert abs(off) < noise + 4 * error
+
+
+def test_every_channel_is_there_in_an_image_of_one_sample(box):
+    integrator = two_level(mode="progressive", channels=",".join(mi.load_dict({"type": "nirc_two_level"}).CHANNELS),
+                           train_frames=2)  # fmt: skip
+    for spp in (1, 16):
+        image = np.array(integrator.render(box, spp=spp))
+        assert image.shape[2] == 3 + len(integrator.aov_names()) and np.isfinite(image).all()
+    assert integrator.statistics()["queries"] > 0
 
 
 def test_one_sample_gives_an_image(box, poor):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import signal
 import threading
@@ -13,11 +14,23 @@ import mitsuba as mi
 
 #: Held while an integrator of this package renders or trains: what one thread records, another must not disturb.
 LOCK = threading.RLock()
+
 #: Shapes that can be part of a recorded function.
 RECORDABLE = {"Mesh", "OBJMesh", "PLYMesh", "SerializedMesh", "BlenderMesh", "Cube", "Rectangle", "Sphere", "Disk",
               "Cylinder", "Instance", "ShapeGroup"}  # fmt: skip
 #: Whether sensors can be recorded, by their kind.
 _freezes: dict[tuple, bool] = {}
+
+
+def locked(method):
+    """A method that renders or trains: it waits for those of other threads, and they for it."""
+
+    @functools.wraps(method)
+    def waits(*args, **keys):
+        with LOCK:
+            return method(*args, **keys)
+
+    return waits
 
 
 def can_freeze(sensor) -> bool:

@@ -102,7 +102,7 @@ class Bounce:
 
 def depth_limit(max_depth: int) -> int:
     """Mitsuba's ``max_depth``, -1 being no limit, as a number to compare depths with."""
-    return max_depth if max_depth >= 0 else NO_LIMIT
+    return min(max_depth, NO_LIMIT) if max_depth >= 0 else NO_LIMIT
 
 
 def start(ray, si, active, max_depth: int = NO_LIMIT) -> PathState:

@@ -67,7 +67,8 @@ def trace(
     def step(state, sampler):
         here = state.path
         numbers, sampler = paths.draw_numbers(sampler)
-        numbers = dr.select(here.depth == 1, numbers_first, numbers)
+        if not walk.may_stay:
+            numbers = dr.select(here.depth == 1, numbers_first, numbers)
         found, sampler = walk.bounce(integrator, scene, lights, here, sampler, numbers)
         path = walk.advance(integrator, here, found)
         path.active &= ~state.ends_lit

@@ -28,6 +28,8 @@ class SurfaceWalk:
     later = 0
     #: Whether vertices may lie in media. Surfaces are not made rougher then.
     in_media = False
+    #: Whether a path may pass surfaces and have the same depth as before: then a number for each depth is not enough.
+    may_stay = False
     #: Probability at most with which a training path survives roulette; vertices after which one that has no end in the
     #: cache is given up, and whether it then ends there.
     most_survival, most_vertices, gives_up = 0.95, 256, True
@@ -84,7 +86,7 @@ class MediaWalk(SurfaceWalk):
     most_survival, most_vertices, gives_up = 1.0, 128, False
 
     def __init__(self, media: Media, camera: mi.Medium | None = None):
-        self.media, self.camera = media, camera
+        self.media, self.camera, self.may_stay = media, camera, media.partial
 
     def camera_vertex(self, integrator, scene, ray, sampler, active):
         return self.media.camera_vertex(integrator, scene, ray, self.camera, sampler, active)
