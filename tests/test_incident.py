@@ -186,6 +186,15 @@ def test_scene_is_measured_before_training(cube):
     assert cache.steps == 0
 
 
+def test_mean_of_a_probe_leaves_out_outliers_unless_there_is_no_other_light():
+    targets = np.ones(10_000)
+    targets[:5] = 1e6
+    assert incident.scale_of(targets) == 1.0
+    targets[5:] = 0.0
+    assert incident.scale_of(targets) == 500.0, "lit in one place of 2000: it was taken to be dark, and stayed so"
+    assert incident.scale_of(0 * targets) == incident.scale_of(targets[:0]) == incident.NOTHING
+
+
 def test_training_converges_to_the_known_light(cube, trained):
     found = answers(trained, *cube)
     rms = np.sqrt(np.mean((found - 0.5) ** 2))
@@ -394,6 +403,23 @@ def test_path_that_ends_on_a_mirror_carries_the_light_that_the_mirror_shows():
             found = target[k][where]
             print(f"vertex {k}: mean of {found.size} targets {found.mean():.4f}, known {known}")
             assert found.size > 300 and found.mean() == pytest.approx(known, rel=0.015)
+
+
+def test_training_that_ends_in_another_light_leaves_a_cache(cube):
+    """Its last check begins anew, and there was nothing to ask until the next step."""
+    scene, sensor = load(light=1e-6)
+    params = mi.traverse(scene)
+
+    def brighten(done, total):
+        if done == 6:
+            for key in [k for k in params.keys() if k.endswith("emitter.radiance.value")]:
+                params[key] = mi.Color3f(0.5)
+            params.update()
+
+    cache = IncidentCache(SMALL)
+    cache.train(scene, sensor, frames=8, progress=brighten)
+    assert cache.field is not None and cache.steps == 0
+    assert float(cache.field.scale[0]) == pytest.approx(0.5, rel=0.2)
 
 
 def test_cache_starts_anew_when_the_light_has_become_brighter_by_far():

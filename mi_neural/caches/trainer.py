@@ -289,6 +289,8 @@ class Trainer:
                     progress(done, frames if frames is not None else at_most)
         if frames != 1:
             self.check()
+            if self.field is None:  # the last steps were in another light
+                self.start(*args)
 
     # -------------------------------------------------------------------------------------------------------------
     # State
