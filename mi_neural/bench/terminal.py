@@ -94,7 +94,8 @@ def require_writable(file: Path | None) -> None:
         return
     if file.is_dir():
         raise InputError(f"{file} is a folder: give the name of a file in it")
-    require_folder(file.parent)
+    if file.is_file() or not file.exists():  # a pipe or a device is written to as it is
+        require_folder(file.parent)
 
 
 def require_folder(folder: Path) -> None:
@@ -229,9 +230,8 @@ def _write_image(path: Path, row: benchmark.Row, image, rendered: budget.Rendere
 
 def slug(row: benchmark.Row) -> str:
     """A file name for a row: nirc_cache_samples-8_steady_0.25s_denoised_2 (second repeat)."""
-    name = re.sub(r"[^\w.-]+", "_", row.label.replace("=", "-"))
     parts = [
-        name,
+        load.file_name(row.label),
         row.mode,
         f"{row.budget_seconds:g}s" if row.budget_seconds else "",
         "denoised" if row.denoised else "",
