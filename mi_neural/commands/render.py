@@ -170,8 +170,9 @@ def render(
             rendered.interrupted = True
         elif until_error is not None:
             bar = bars(f"rendering until the error is {until_error:g}")
+            left = None if seconds is None else max(seconds - seconds_first, 0.0)  # training counts
             rendered, estimate = budget.render_until(
-                loaded.scene, case.integrator, until_error, seconds, seed, progress=bar, keep=keep
+                loaded.scene, case.integrator, until_error, left, seed, progress=bar, keep=keep
             )
         elif seconds is not None:
             rendered = budget.render_seconds(
