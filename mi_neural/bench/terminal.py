@@ -98,6 +98,19 @@ def require_writable(file: Path | None) -> None:
         require_folder(file.parent)
 
 
+def require_unlike(**files: Path | str | None) -> None:
+    """Raise :class:`InputError` where two options, named as variables are, have the same file."""
+    known: dict[Path, str] = {}
+    for name, file in files.items():
+        path = None if file is None else Path(file).expanduser().resolve()
+        if path is None or (path.exists() and not path.is_file()):
+            continue
+        option = f"--{name.replace('_', '-')}"
+        if path in known:
+            raise InputError(f"{known[path]} and {option} are both {file}: give two files")
+        known[path] = option
+
+
 def require_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
