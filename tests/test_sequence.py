@@ -182,6 +182,7 @@ def test_expressions_know_frame_time_and_change():
     assert result("look_at([1, 2, 3], [0, 0.5, 0])", 0) == pytest.approx(
         np.array(T().look_at([1, 2, 3], [0, 0.5, 0], [0, 1, 0]).matrix), abs=1e-6
     )
+    assert result("([1, 2, 3] * 99999999999)[frame] / 99999999999", 2) == 3, "no list of so many numbers"
     assert result("2 ** frame", 10) == pytest.approx(1024)
 
 
@@ -204,6 +205,8 @@ BAD = {
     "attribute": ({"irradiance": "value.real"}, "'value.real' is not allowed"),
     "import": ({"irradiance": "__import__('os')"}, "unknown name '__import__'"),
     "text": ({"irradiance": "'a' * 9"}, "is not allowed"),
+    "shift": ({"irradiance": "value * (1 << 99)"}, "is not allowed"),
+    "long name": ({"irradiance": "bitmap('%999999999d.exr')"}, "needs one place for the frame"),
     "lambda": ({"irradiance": "(lambda: 1)()"}, "is not allowed"),
     "when": ({"irradiance": "value * after"}, "uses 'after': say when, with --change-at FRAME"),
     "no bitmap": ({"irradiance": "bitmap('x.exr')"}, "no file x.exr"),
