@@ -405,6 +405,29 @@ def test_path_that_ends_on_a_mirror_carries_the_light_that_the_mirror_shows():
             assert found.size > 300 and found.mean() == pytest.approx(known, rel=0.015)
 
 
+def test_light_that_few_paths_find_is_learned_after_the_dark():
+    """A hundred times brighter than nothing in one record of some hundred is not a hundred times brighter in the mean:
+    the cache stayed black."""
+    aim = mi.ScalarTransform4f().look_at([0, 3, 0], [0.5, -4, 0.3], [1, 0, 0])
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 3.9], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "room": {"type": "cube", "flip_normals": True, "to_world": mi.ScalarTransform4f().scale(4)},
+        "beam": {"type": "spot", "to_world": aim, "cutoff_angle": 1.5, "intensity": 0.0},
+    })  # fmt: skip
+    cache = IncidentCache(SMALL)
+    cache.train(scene, scene.sensors()[0], frames=9)
+    assert float(cache.field.scale[0]) <= incident.NOTHING and cache.steps == 9
+    params = mi.traverse(scene)
+    params["beam.intensity.value"] = mi.Color3f(1e4)
+    params.update()
+    cache.train(scene, scene.sensors()[0], frames=20)
+    lit = np.mean(np.array(trace_records(scene, scene.sensors()[0], None, SMALL, mi.UInt32(1))[0].target)[0] > 0)
+    print(f"{100 * lit:.2f} % of records are lit, scale {float(cache.field.scale[0]):.3g}")
+    assert 0 < lit < 0.01 and float(cache.field.scale[0]) > 1e-4 and cache.steps < 20
+
+
 def test_training_that_ends_in_another_light_leaves_a_cache(cube):
     """Its last check begins anew, and there was nothing to ask until the next step."""
     scene, sensor = load(light=1e-6)

@@ -326,6 +326,9 @@ class IncidentCache(Trainer):
         self.field, self.ages = self.make_field(low, high, scale_of(target)), Ages(low, high)
         dr.eval(self.field)
 
+    def found_no_light(self) -> bool:
+        return float(self.field.scale[0]) <= NOTHING
+
     def train_step(self, scene, sensor, lights=None) -> None:
         """Trace fresh records and take one step on them."""
         seed = mi.UInt32(self.random_seed(self.steps))
