@@ -241,6 +241,8 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "--reference", "nan.exr"), "non-finite pixels"),
         ((*RENDER, "-i", "path", "--save-cache", "c"), "path has no cache"),
         ((*RENDER, "-i", "path", "--pretrain", "3"), "path has no cache"),
+        ((*RENDER, "-i", "plain_path", "--pretrain", "3"), "plain_path has no cache"),
+        ((*RENDER, "-i", "plain_path:light_sampler.type=tree_lights", "--pretrain", "3"), "plain_path.* has no cache"),
         ((*RENDER, "-i", "fake_cache", "--load-cache", "no"), "no cache file no"),
         (COMPARE, "add -o DIR"),
         ((*COMPARE, "-o", "file/out"), "cannot write to the folder"),

@@ -123,12 +123,16 @@ def require_folder(folder: Path) -> None:
 def require_cache_methods(
     case: benchmark.Case, pretrain: int, save_cache: Path | None, load_cache: Path | None
 ) -> None:
-    for option, asked, method in (
-        ("--pretrain", pretrain, "train"),
-        ("--save-cache", save_cache, "save_cache"),
-        ("--load-cache", load_cache, "load_cache"),
+    """Raise :class:`InputError` where an option would have no effect: the integrator has no cache, or, to be trained,
+    neither one nor a light sampler that learns."""
+    has_cache = hasattr(case.integrator, "save_cache")
+    sampler = getattr(case.integrator, "light_sampler", None)
+    for option, asked, able in (
+        ("--pretrain", pretrain, has_cache or getattr(sampler, "cache", None) is not None),
+        ("--save-cache", save_cache, has_cache),
+        ("--load-cache", load_cache, has_cache),
     ):
-        if asked and not hasattr(case.integrator, method):
+        if asked and not able:
             raise InputError(
                 f"{option}: {case.spec.type} has no cache; choose an integrator that has one, like -i nirc"
             )
