@@ -78,7 +78,7 @@ class LightSampler(mi.Emitter):
                 f"{self.plugin}: inside a function frozen by dr.freeze a light sampler cannot follow the lights; leave "
                 "it out there, for example mi.load_dict({'type': 'plain_path'})"
             )
-        if self.scene.changed(scene):
+        if not self.scene.knows(scene):
             self.reset()
             self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
@@ -88,17 +88,26 @@ class LightSampler(mi.Emitter):
                 "environment_cells ends the process on a GPU (Dr.Jit 1.5.0); set environment_cells=0, or type "
                 "mi.set_variant('llvm_ad_rgb')",
             )
+            self.scene.changed(scene)  # last: what was refused or interrupted is tried again
         if self.edits is None:
             return None
         with dr.suspend_grad():
             if self.edits.changed():
-                table = LightTable(scene, texels=self.plan.modelled("environment_cells"))
-                chooses = table.n_lights > 1 or self.plan_mode == "everything" or self.plan.facts.inexact
-                self.sampler = self.make(scene, table) if chooses else None
+                self.sampler = self._made(scene)
             if self.sampler is not None and train:
                 with dr.resume_grad():
                     self.train(scene, sensor)
         return self.sampler
+
+    def _made(self, scene):
+        """What chooses among the lights as they are now; None where there is but one."""
+        try:
+            table = LightTable(scene, texels=self.plan.modelled("environment_cells"))
+            chooses = table.n_lights > 1 or self.plan_mode == "everything" or self.plan.facts.inexact
+            return self.make(scene, table) if chooses else None
+        except BaseException:  # refused or interrupted: the next image tries again
+            self.edits.forget()
+            raise
 
     def to_string(self):
         return f"{type(self).__name__}[plan = {self.plan or self.plan_mode}]"

@@ -13,9 +13,11 @@ class PowerLightSampler(LightSampler):
     Choice of lights by power (:monosp:`power_lights`)
     ---------------------------------------------------
 
-    Chooses light :math:`i` with a probability proportional to its power :math:`\Phi_i`, or, for lights at infinity, to
-    what they give the whole scene; a tenth of the probability is shared equally. A light is an emissive triangle (a
-    rectangle counts as one light), or any other emitter as a whole. Unbiased.
+    Chooses light :math:`i` with a probability proportional to :math:`\Phi_i`; a tenth of the probability is shared
+    equally. :math:`\Phi_i` is the power :math:`\pi L A` of a surface; of a lamp without extent :math:`\pi` times its
+    largest radiant intensity, so that it counts as a surface that gives as much to what it faces; of a light at
+    infinity its irradiance times the cross-section of the scene. A light is an emissive triangle (a rectangle counts as
+    one light), or any other emitter as a whole. Unbiased.
 
     .. pluginparameters::
 

@@ -51,6 +51,10 @@ class Edits:
         self.kept = now, [type(v)(v) for v in arrays]
         return True
 
+    def forget(self) -> None:
+        """Let the next call of :meth:`changed` be as the first one."""
+        self.kept = None
+
     def _read(self) -> tuple[list, list]:
         """Values now: arrays, and others as what can be compared."""
         arrays, others = [], []

@@ -362,6 +362,18 @@ def test_variance_of_a_reference_is_that_of_its_mean(tmp_path):
     assert (squared[lit] / variance[lit]).mean() == pytest.approx(14 / 12, rel=0.25)
 
 
+def test_pixel_that_is_no_number_in_a_pass_of_a_reference_is_left_out_of_that_pass(rng):
+    passes = list(rng.uniform(1, 2, (5, 1, 2, 3)))
+    known = np.mean(passes[1:], axis=0), np.var(passes[1:], axis=0, ddof=1) / 4
+    moments = reference._Moments()
+    for k, image in enumerate(passes):
+        moments.add(np.where((k == 0) & (np.arange(2) == 0)[:, None], np.nan, image))
+    np.testing.assert_allclose(moments.mean[:, :1], known[0][:, :1])
+    np.testing.assert_allclose(moments.variance()[:, :1], known[1][:, :1])
+    np.testing.assert_allclose(moments.mean[:, 1], np.mean(passes, axis=0)[:, 1])
+    np.testing.assert_allclose(moments.variance()[:, 1], (np.var(passes, axis=0, ddof=1) / 5)[:, 1])
+
+
 def test_interrupted_reference_keeps_its_passes(loaded, tmp_path):
     size = reference.pass_spp(loaded.scene)
 

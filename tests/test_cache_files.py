@@ -262,6 +262,13 @@ def test_whole_cache_of_an_integrator_is_written_or_none(cube, tmp_path, monkeyp
     assert (tmp_path / "a.npz").read_bytes() == before and os.listdir(tmp_path) == ["a.npz"]
 
 
+def test_cache_is_written_through_a_link(tmp_path):
+    files.write(tmp_path / "a.npz", "fake", {}, {"x": np.ones(3)})
+    (tmp_path / "link.npz").symlink_to("a.npz")
+    files.write(tmp_path / "link.npz", "fake", {}, {"x": np.zeros(3)})
+    assert (files.read(tmp_path / "a.npz", "fake")[1]["x"] == 0).all() and (tmp_path / "link.npz").is_symlink()
+
+
 def test_facts_in_the_header_are_those_of_the_integrator(cube, tmp_path):
     scene, _ = cube
     nrc = mi.load_dict({"type": "nrc", **SMALL})

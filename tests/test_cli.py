@@ -233,10 +233,16 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "--json", "file/a.json"), "cannot write to the folder file"),
         ((*RENDER, "--reference", "no.exr"), "no reference no.exr"),
         ((*RENDER, "--reference", "file"), "not a readable EXR"),
+        ((*RENDER, "-i", "path", "-o", "a.exr", "--json", "./a.exr"), "--output and --json are both a.exr"),
+        ((*RENDER, "--reference", "fits.exr", "-o", "fits.exr"), "--reference and --output are both fits.exr"),
+        ((*RENDER, "-i", "fake_cache", "--load-cache", "file", "--json", "file"), "--json and --load-cache are both"),
+        ((*RENDER, "-i", "fake_cache", "--save-cache", "c", "-o", "a.png", "--json", "c"), "--json and --save-cache"),
         ((*RENDER, "--reference", "other.exr"), "other.exr is 5x4, the image 16x12"),
         ((*RENDER, "--reference", "nan.exr"), "non-finite pixels"),
         ((*RENDER, "-i", "path", "--save-cache", "c"), "path has no cache"),
         ((*RENDER, "-i", "path", "--pretrain", "3"), "path has no cache"),
+        ((*RENDER, "-i", "plain_path", "--pretrain", "3"), "plain_path has no cache"),
+        ((*RENDER, "-i", "plain_path:light_sampler.type=tree_lights", "--pretrain", "3"), "plain_path.* has no cache"),
         ((*RENDER, "-i", "fake_cache", "--load-cache", "no"), "no cache file no"),
         (COMPARE, "add -o DIR"),
         ((*COMPARE, "-o", "file/out"), "cannot write to the folder"),
@@ -257,6 +263,7 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message):
     Path("file").write_text("a file, no folder")
     exr.write("other.exr", np.ones((4, 5, 3)))
+    exr.write("fits.exr", np.ones((12, 16, 3)))
     exr.write("nan.exr", np.full((12, 16, 3), np.nan))
     result = run(*arguments, code=2)
     lines = result.output.strip().splitlines()

@@ -1,6 +1,7 @@
 """Images come back as they were written, whole or not at all."""
 
 import io
+import os
 
 import numpy as np
 import pytest
@@ -62,6 +63,26 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
         raise RuntimeError
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_no_file_is_written_to_and_not_replaced(tmp_path):
+    """As `root` a file took the place of ``/dev/null``."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        exr.write_text(pipe, "all of it")
+        assert os.read(reader, 100) == b"all of it" and pipe.is_fifo() and os.listdir(tmp_path) == ["pipe"]
+    finally:
+        os.close(reader)
+
+
+def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path):
+    (tmp_path / "link.txt").symlink_to("of/file.txt")
+    (tmp_path / "of").mkdir()
+    for text in ("new", "newer"):
+        exr.write_text(tmp_path / "link.txt", text)
+        assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "of" / "file.txt").read_text() == text
 
 
 def test_bad_input_is_refused(tmp_path, rgb):

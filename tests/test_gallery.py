@@ -6,12 +6,13 @@ import shlex
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from mi_neural import cli
 from mi_neural.bench import gallery
 from mi_neural.bench.load import InputError
-from mi_neural.image import exr
+from mi_neural.image import exr, metrics
 
 
 @pytest.fixture
@@ -78,6 +79,29 @@ def test_commands_of_pictures_have_options_that_exist(results):
     for command in commands:
         for option in (w for w in shlex.split(command) if w.startswith("-")):
             assert re.search(rf"(^|[\s,]){option}\b", help_), option
+
+
+def test_commands_of_pictures_have_what_was_typed_in_any_form(results):
+    typed = "mi-neural compare box.xml --set train_steps=2 --set outputs=4 -D a=1 -Db=2 --define=c=3 --define d=4 -o x"
+    row = json.loads((results / "1_box" / "results.json").read_text())["rows"][-1]
+    made = gallery.command_of({**row, "parameters": {"train_steps": 2}}, typed)
+    assert " --set train_steps=2 -D a=1 -D b=2 -D c=3 -D d=4 --size " in made
+
+
+def test_images_are_compared_with_a_reference_of_another_size_as_compare_does(results):
+    small = exr.read(results / "1_box" / "reference.exr").rgb
+    for shape in ((16, 24), (4, 6)):
+        reference = np.repeat(np.repeat(small, 2, 0), 2, 1) if shape[0] > 8 else metrics.block_means(small, shape)
+        exr.write(results / "1_box" / "reference.exr", reference)
+        gallery.write(results)
+        assert exr_png_mean(results / "1_box/path_flip.png") < 3
+
+
+def test_program_says_in_one_line_what_is_wrong(tmp_path):
+    made = typer.Typer()
+    made.command()(gallery.main)
+    found = CliRunner().invoke(made, [str(tmp_path)])
+    assert found.exit_code == 2 and found.output.startswith(f"{tmp_path} holds no results") and "\n" == found.output[-1]
 
 
 def test_sheet_and_animation(results):

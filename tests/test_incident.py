@@ -186,6 +186,15 @@ def test_scene_is_measured_before_training(cube):
     assert cache.steps == 0
 
 
+def test_mean_of_a_probe_leaves_out_outliers_unless_there_is_no_other_light():
+    targets = np.ones(10_000)
+    targets[:5] = 1e6
+    assert incident.scale_of(targets) == 1.0
+    targets[5:] = 0.0
+    assert incident.scale_of(targets) == 500.0, "lit in one place of 2000: it was taken to be dark, and stayed so"
+    assert incident.scale_of(0 * targets) == incident.scale_of(targets[:0]) == incident.NOTHING
+
+
 def test_training_converges_to_the_known_light(cube, trained):
     found = answers(trained, *cube)
     rms = np.sqrt(np.mean((found - 0.5) ** 2))
@@ -394,6 +403,46 @@ def test_path_that_ends_on_a_mirror_carries_the_light_that_the_mirror_shows():
             found = target[k][where]
             print(f"vertex {k}: mean of {found.size} targets {found.mean():.4f}, known {known}")
             assert found.size > 300 and found.mean() == pytest.approx(known, rel=0.015)
+
+
+def test_light_that_few_paths_find_is_learned_after_the_dark():
+    """A hundred times brighter than nothing in one record of some hundred is not a hundred times brighter in the mean:
+    the cache stayed black."""
+    aim = mi.ScalarTransform4f().look_at([0, 3, 0], [0.5, -4, 0.3], [1, 0, 0])
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 3.9], [0, 0, 0], [0, 1, 0]),
+                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+        "room": {"type": "cube", "flip_normals": True, "to_world": mi.ScalarTransform4f().scale(4)},
+        "beam": {"type": "spot", "to_world": aim, "cutoff_angle": 1.5, "intensity": 0.0},
+    })  # fmt: skip
+    cache = IncidentCache(SMALL)
+    cache.train(scene, scene.sensors()[0], frames=9)
+    assert float(cache.field.scale[0]) <= incident.NOTHING and cache.steps == 9
+    params = mi.traverse(scene)
+    params["beam.intensity.value"] = mi.Color3f(1e4)
+    params.update()
+    cache.train(scene, scene.sensors()[0], frames=20)
+    lit = np.mean(np.array(trace_records(scene, scene.sensors()[0], None, SMALL, mi.UInt32(1))[0].target)[0] > 0)
+    print(f"{100 * lit:.2f} % of records are lit, scale {float(cache.field.scale[0]):.3g}")
+    assert 0 < lit < 0.01 and float(cache.field.scale[0]) > 1e-4 and cache.steps < 20
+
+
+def test_training_that_ends_in_another_light_leaves_a_cache(cube):
+    """Its last check begins anew, and there was nothing to ask until the next step."""
+    scene, sensor = load(light=1e-6)
+    params = mi.traverse(scene)
+
+    def brighten(done, total):
+        if done == 6:
+            for key in [k for k in params.keys() if k.endswith("emitter.radiance.value")]:
+                params[key] = mi.Color3f(0.5)
+            params.update()
+
+    cache = IncidentCache(SMALL)
+    cache.train(scene, sensor, frames=8, progress=brighten)
+    assert cache.field is not None and cache.steps == 0
+    assert float(cache.field.scale[0]) == pytest.approx(0.5, rel=0.2)
 
 
 def test_cache_starts_anew_when_the_light_has_become_brighter_by_far():

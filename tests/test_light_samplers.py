@@ -3,12 +3,14 @@
 Images are compared with Mitsuba's `path` by z-tests that fail a correct sampler in one of 10,000 choices of seed.
 """
 
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from expectation import assert_same_mean, renders
-from light_scenes import glow, picture, random_triangles, triangles
+from light_scenes import glow, picture, random_triangles, row, triangles
 from test_vertex import lights, test_scene
 
 from mi_neural.caches.visibility import VisibilityTraining
@@ -342,6 +344,18 @@ def test_table_follows_a_light_that_changes(key):
         np.testing.assert_allclose(after.table.columns[name], values, rtol=1e-6, err_msg=name)
 
 
+def test_shell_that_comes_about_a_scene_hides_all_parts_of_the_sky():
+    """Points on the sky were put at twice the size that the scene had when its lights were read."""
+    lid = {"type": "sphere", "center": [4, 0, 0], "radius": 0.1}
+    scene = test_scene({"sky": {"type": "constant", "radiance": 1.0}, "lid": lid}, 8)
+    integrator = path_with("untrained cells")
+    assert np.array(integrator.render(scene, spp=16)).mean() > 0.1
+    params = mi.traverse(scene)
+    params["lid.to_world"] = mi.Transform4f().scale(200.0)
+    params.update()
+    assert (np.array(integrator.render(scene, spp=16)) == 0).all()
+
+
 def test_table_follows_lights_that_change_several_times_between_images():
     """A variable's number is free again once it is gone: the last value may bear the first one's."""
     scene = shadow_scene()
@@ -494,6 +508,14 @@ def test_frozen_pass_learns_that_groups_have_other_sizes(tmp_path):
 # ---------------------------------------------------------------- bad input
 
 
+def test_seeds_may_have_more_than_32_bits(place):
+    scene, _ = place("two")
+    integrator = path_with({"type": "nvc_lights", "train_frames": 1, "train_samples": 64, "seed": 2**40})
+    first = np.array(integrator.render(scene, spp=1))
+    integrator.reseed(2**40 + 1)
+    assert not np.array_equal(np.array(integrator.render(scene, spp=1)), first)
+
+
 @pytest.mark.parametrize("key, value", [
     ("outputs", 1), ("outputs", 257), ("candidates", 0), ("train_frames", -1), ("train_steps", -1), ("train_samples",
         3),
@@ -545,6 +567,37 @@ def test_too_few_outputs_for_the_lights_are_refused_by_render():
     integrator = path_with({"type": "nvc_lights", "outputs": 5, "clusters": "emitter"})
     with pytest.raises(ValueError, match=r"nvc_lights: there are 6 emitters.*5 outputs"):
         integrator.render(scene, spp=1)
+
+
+def test_what_is_refused_once_is_refused_again():
+    """Without a sampler the second image would choose lights as Mitsuba does, and not say so."""
+    scene = shadow_scene()
+    integrator = path_with({"type": "nvc_lights", "outputs": 2, "train_frames": 1})
+    for _ in range(2):
+        with pytest.raises(ValueError, match="raise outputs"):
+            integrator.render(scene, spp=1)
+
+
+@pytest.mark.parametrize("edited", [False, True])
+def test_a_table_whose_making_was_interrupted_is_made_by_the_next_image(monkeypatch, edited):
+    scene = shadow_scene()
+    sampler = mi.load_dict({"type": "power_lights"})
+    if edited:
+        sampler.lights(scene, scene.sensors()[0])
+        params = mi.traverse(scene)
+        params["spark.intensity.value"] = mi.Color3f(7.0)
+        params.update()
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules["mi_neural.emitters.common"], "LightTable", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            sampler.lights(scene, scene.sensors()[0])
+    found = sampler.lights(scene, scene.sensors()[0])
+    (spark,) = row(scene, found.table, "spark")
+    assert found.table.columns["radiance"][spark, 0] == (7.0 if edited else 1.0)
 
 
 def test_a_light_sampler_gives_no_light_where_it_stands_among_emitters():

@@ -157,6 +157,14 @@ def test_two_rectangles_of_unlike_halves_stay_two_lights(tmp_path, rng):
         assert LightTable(mi.load_dict({"type": "scene", "m": mesh})).n_lights == known
 
 
+def test_halves_of_a_rectangle_that_shine_to_opposite_sides_are_two_lights(tmp_path):
+    """As one light, either half would be sampled where the other one is seen from behind."""
+    halves = [[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [0, 1, 0], [1, 1, 0]]]
+    mesh = {**triangles(tmp_path / "m.ply", halves), "emitter": glow()}
+    table = LightTable(mi.load_dict({"type": "scene", "m": mesh}))
+    np.testing.assert_array_equal(table.columns["normal"], [[0, 0, 1], [0, 0, -1]])
+
+
 def test_radiance_of_a_picture_is_its_mean_and_not_plain():
     light = {"type": "rectangle", "emitter": glow(picture(pixels()))}
     c = LightTable(mi.load_dict({"type": "scene", "light": light})).columns
@@ -196,6 +204,14 @@ def test_spot_light_whose_picture_is_mostly_black_keeps_an_intensity():
     spot[20, 40] = 1000
     torch = {**MIXED["torch"], "texture": picture(spot)}
     assert (LightTable(scene_of({"torch": torch, "spark": MIXED["spark"]})).columns["intensity"] > 0).all()
+
+
+def test_narrow_beams_alone_keep_an_intensity():
+    """None of the directions that are looked along lies within them; with intensity 0 they were never chosen."""
+    beam = {"type": "spot", "intensity": 1.0, "cutoff_angle": 0.2}
+    aim = [mi.ScalarTransform4f().look_at([x, 0, 3], [x + 0.3, 0.2, 0], [0, 1, 0]) for x in (-1, 1)]
+    table = LightTable(scene_of({f"beam_{k}": {**beam, "to_world": to_world} for k, to_world in enumerate(aim)}))
+    assert (table.columns["intensity"] > 0).all()
 
 
 @pytest.mark.filterwarnings("error")

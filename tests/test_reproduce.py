@@ -83,8 +83,12 @@ def test_interrupted_entry_goes_on_without_measuring_again(tmp_path, monkeypatch
 def test_damaged_part_is_measured_again(tmp_path):
     group = Work(tmp_path).group("fake", {})
     (group.folder / "part.json").write_text('{"error": 0.')
-    assert group.part("part", lambda bar: Part({"error": 1.0})).numbers == {"error": 1.0}
-    assert json.loads((group.folder / "part.json").read_text()) == {"error": 1.0}
+    for array in (1.0, 2.0):
+        made = group.part("part", lambda bar, array=array: Part({"error": 1.0}, {"image": np.full(9, array)}))
+        assert made.numbers == json.loads((group.folder / "part.json").read_text()) == {"error": 1.0}
+        assert (made.arrays["image"] == array).all()
+        arrays = group.folder / "part.npz"
+        arrays.write_bytes(arrays.read_bytes()[:-30])
 
 
 @pytest.mark.parametrize("agrees, word", [(True, "agrees"), (False, "differs: why"), (None, "not comparable: why")])

@@ -11,7 +11,7 @@ import pytest
 from fake_cache import register
 from typer.testing import CliRunner
 
-from mi_neural.bench import benchmark, changes, load, plots, sequence
+from mi_neural.bench import benchmark, changes, load, plots, sequence, sequence_pictures
 from mi_neural.bench.load import InputError
 from mi_neural.cli import app
 from mi_neural.image import exr
@@ -182,6 +182,7 @@ def test_expressions_know_frame_time_and_change():
     assert result("look_at([1, 2, 3], [0, 0.5, 0])", 0) == pytest.approx(
         np.array(T().look_at([1, 2, 3], [0, 0.5, 0], [0, 1, 0]).matrix), abs=1e-6
     )
+    assert result("([1, 2, 3] * 99999999999)[frame] / 99999999999", 2) == 3, "no list of so many numbers"
     assert result("2 ** frame", 10) == pytest.approx(1024)
 
 
@@ -204,6 +205,8 @@ BAD = {
     "attribute": ({"irradiance": "value.real"}, "'value.real' is not allowed"),
     "import": ({"irradiance": "__import__('os')"}, "unknown name '__import__'"),
     "text": ({"irradiance": "'a' * 9"}, "is not allowed"),
+    "shift": ({"irradiance": "value * (1 << 99)"}, "is not allowed"),
+    "long name": ({"irradiance": "bitmap('%999999999d.exr')"}, "needs one place for the frame"),
     "lambda": ({"irradiance": "(lambda: 1)()"}, "is not allowed"),
     "when": ({"irradiance": "value * after"}, "uses 'after': say when, with --change-at FRAME"),
     "no bitmap": ({"irradiance": "bitmap('x.exr')"}, "no file x.exr"),
@@ -334,7 +337,7 @@ def test_a_cache_is_brought_back(loaded, tmp_path):
     assert exr.read(folder / "frame_0003.exr").channels["frames"].max() == 5
 
 
-def test_other_settings_need_another_folder(loaded, tmp_path):
+def test_other_settings_need_another_folder(loaded, tmp_path, monkeypatch):
     run, cases = run_of(loaded, tmp_path, reference=None)
     run.run(cases)
     for arguments, message in (
@@ -344,6 +347,11 @@ def test_other_settings_need_another_folder(loaded, tmp_path):
     ):
         other, cases = run_of(loaded, tmp_path, **{"reference": None, **arguments})
         with pytest.raises(InputError, match=message):
+            other.run(cases)
+    with monkeypatch.context() as patch:
+        patch.setattr("mi_neural.__version__", "9.9")
+        other, cases = run_of(loaded, tmp_path, reference=None)
+        with pytest.raises(InputError, match=r"frames of another run \(version: .* there, 9.9 now\)"):
             other.run(cases)
     twice, cases = run_of(loaded, tmp_path, specs=["path", "path"], reference=None)
     with pytest.raises(InputError, match="would share the folder path"):
@@ -385,7 +393,7 @@ def test_crops_are_where_it_changes_and_where_it_does_not(rng):
     before[:24, :16] = 0.0  # dark and unchanged: not worth a crop
     after = before * (1 + 0.01 * rng.random((48, 64, 1)))
     after[30:42, 40:56] *= 3.0
-    (x, y, w, h), (x2, y2, _, _) = plots.choose_crops(before, after)
+    (x, y, w, h), (x2, y2, _, _) = sequence_pictures.choose_crops(before, after)
     assert (x, y, w, h) == (40, 30, 16, 12)
     assert before[y2 : y2 + h, x2 : x2 + w].mean() > 0.4 and (x2 + w <= x or x2 >= x + w or y2 + h <= y or y2 >= y + h)
 

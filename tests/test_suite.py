@@ -297,6 +297,15 @@ def test_images_made_elsewhere_say_which_of_several_scenes_they_show():
         assert expected in compare(*quick, typed, code=2).replace("\n", " ")
 
 
+def test_integrators_and_images_whose_files_would_have_one_name_are_refused():
+    """They were one row with an interval of confidence of width 0."""
+    exr.write("flat.exr", np.full((8, 8, 3), 1.0))
+    more = {"-i": "path:max_depth=2", "--image": "path_max_depth-2=flat.exr,seconds=1"}
+    for option, typed in more.items():
+        said = compare("-i", "path:max_depth=2", "--seconds", "0.01", option, typed, of=MOON, code=2)
+        assert "would share the files path_max_depth-2" in said.replace("\n", " ")
+
+
 def test_image_made_elsewhere_of_another_size_is_refused():
     exr.write("wide.exr", np.full((5, 9, 3), 1.0))
     Path("other.exr").write_text("no image")

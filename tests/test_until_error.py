@@ -100,6 +100,22 @@ def test_command_says_what_was_reached(tmp_path, monkeypatch):
     assert refused.exit_code == 2 and "compares passes" in refused.output
 
 
+def test_training_counts_in_the_time_that_ends_it(tmp_path, monkeypatch):
+    asked, render_until = [], budget.render_until
+
+    def rendered(scene, integrator, error, seconds, *more, **keys):
+        asked.append(seconds)
+        return render_until(scene, integrator, 1.0, seconds, *more, **keys)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(budget, "render_until", rendered)
+    monkeypatch.setattr(budget, "train_first", lambda *_, **__: (3.0, False))
+    typed = ["render", "cornell_box", "-i", "path", "--size", "8x8", "--until-error", "0.1", "-o", "a.exr", "--seconds"]
+    for seconds in ("10", "2"):
+        assert CliRunner().invoke(cli.app, [*typed, seconds]).exit_code == 0
+    assert asked == [7.0, 0.0]
+
+
 def test_study_says_what_was_asked_estimated_and_found(tmp_path, capsys):
     """In the point-lit sphere, where the image is 1 and its noise is small."""
     study = load_study("until_error")

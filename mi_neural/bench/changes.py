@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import difflib
 import hashlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -297,7 +298,9 @@ FUNCTIONS = {
 VARIABLES = ("value", "frame", "n", "t", "after", "s")
 _NODES = (
     ast.Expression, ast.BinOp, ast.UnaryOp, ast.Compare, ast.IfExp, ast.Call, ast.keyword, ast.Name, ast.Load,
-    ast.Constant, ast.List, ast.Tuple, ast.Subscript, ast.Slice, ast.operator, ast.unaryop, ast.cmpop,
+    ast.Constant, ast.List, ast.Tuple, ast.Subscript, ast.Slice, ast.unaryop, ast.cmpop,
+    # not <<, which makes integers of any length
+    ast.Add, ast.Sub, ast.Mult, ast.MatMult, ast.Div, ast.FloorDiv, ast.Mod, ast.Pow, ast.BitAnd, ast.BitOr, ast.BitXor,
 )  # fmt: skip
 
 
@@ -328,7 +331,7 @@ def expression(key: str, text: str, frames: int, change_at: int | None = None) -
                              f"{', '.join(sorted({*FUNCTIONS, 'bitmap'}))}")  # fmt: skip
         if change_at is None and isinstance(node, ast.Name) and node.id in ("after", "s"):
             raise InputError(f"{where} uses {node.id!r}: say when, with --change-at FRAME")
-    tree = ast.fix_missing_locations(_FloatPowers().visit(tree))
+    tree = ast.fix_missing_locations(_Bounded().visit(tree))
     code = compile(tree, where, "eval")
 
     def function(frame: int, value: np.ndarray) -> np.ndarray:
@@ -358,13 +361,20 @@ def parse(texts: list[str], frames: int, change_at: int | None = None) -> dict[s
     return functions
 
 
-class _FloatPowers(ast.NodeTransformer):
-    """``a ** b`` in floating point: integers of any length could take unlimited time."""
+class _Bounded(ast.NodeTransformer):
+    """``a ** b`` in floating point, as integers of any length could take unlimited time, and lists as arrays, as
+    ``[0] * n`` could take unlimited memory."""
 
     def visit_BinOp(self, node):
-        self.generic_visit(node)
+        left, right = (self._array(self.visit(side)) for side in (node.left, node.right))
         if isinstance(node.op, ast.Pow):
-            return ast.Call(ast.Name("_power", ast.Load()), [node.left, node.right], [])
+            return ast.Call(ast.Name("_power", ast.Load()), [left, right], [])
+        return ast.BinOp(left, node.op, right)
+
+    @staticmethod
+    def _array(node):
+        if isinstance(node, (ast.List, ast.Tuple)):
+            return ast.Call(ast.Name("array", ast.Load()), [node], [])
         return node
 
 
@@ -381,6 +391,8 @@ def bitmap(pattern: str, frame: int, shape: tuple[int, ...]) -> np.ndarray:
     import mitsuba as mi
 
     try:
+        if re.search(r"%[^a-zA-Z%]*\d{3}", pattern):
+            raise ValueError  # a name of so many letters
         name = pattern % frame if "%" in pattern else pattern
     except (TypeError, ValueError):
         raise ValueError(f"bitmap: {pattern!r} needs one place for the frame, like picture_%04d.exr") from None

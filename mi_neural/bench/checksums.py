@@ -13,11 +13,11 @@ import datetime
 import functools
 import hashlib
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mi_neural import scenes
+from mi_neural.image import exr
 from mi_neural.scenes import public
 
 BLOCK = 1 << 18
@@ -136,6 +136,4 @@ def read_json(file: Path) -> dict:
 
 def write_json(file: Path, what: dict) -> None:
     """Write a dictionary; the file is whole at any time."""
-    new = file.with_name(f"{file.name}.{os.getpid()}")
-    new.write_text(json.dumps(what, indent=1) + "\n", encoding="utf-8")
-    os.replace(new, file)
+    exr.write_text(file, json.dumps(what, indent=1) + "\n")

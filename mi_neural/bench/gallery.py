@@ -10,6 +10,7 @@ from __future__ import annotations
 import html
 import json
 import shlex
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -18,9 +19,10 @@ import typer
 
 from mi_neural.image import exr, metrics
 
-from .load import InputError
+from .load import InputError, one_line
 from .montage import montage
 from .page import flip_colours
+from .reference import load_reference
 from .report import number
 from .sequence import frame_path
 
@@ -74,7 +76,7 @@ def _comparison(folder: Path, found: dict, k: int, root: Path) -> tuple[str, lis
     scene, several = found["scenes"][k], len(found["scenes"]) > 1
     report = folder.relative_to(root) / "report.html"
     folder = folder / scene["scene"] if several else folder
-    reference = exr.read(_reference_path(folder, scene)).rgb
+    reference = load_reference(_reference_path(folder, scene), tuple(scene["size"]), scaled=True).rgb
     exposure = exr.automatic_exposure(reference)
     exr.write_png(folder / "reference.png", reference, exposure)
     name = folder.relative_to(root)
@@ -89,7 +91,7 @@ def _comparison(folder: Path, found: dict, k: int, root: Path) -> tuple[str, lis
         rgb = exr.read(folder / row["image"]).rgb
         stem = Path(row["image"]).stem
         exr.write_png(folder / f"{stem}.png", rgb, exposure)
-        error = metrics.flip(rgb, reference)
+        error = metrics.flip(metrics.block_means(rgb, reference.shape), reference)
         exr.write_bytes(folder / f"{stem}_flip.png", exr.png_bytes(flip_colours(error.map)))
         pictures.append(exr.to_srgb8(rgb, exposure))
         shown = [name / f"{stem}.png", name / f"{stem}_flip.png"]
@@ -123,15 +125,24 @@ def command_of(row: dict, command: str) -> str:
     named = [word for word in shlex.split(command)[2:] if Path(word).stem == row["scene"]]
     words = ["mi-neural", "render", *(named[:1] or [row["scene"]]), "-i", row["label"]]
     width, height = row["size"]
-    words += [*_defines(command), "--size", f"{width}x{height}"]
+    keys = [text for text in _given(command, "--set") if text.partition("=")[0] in row.get("parameters", {})]
+    words += [word for text in keys for word in ("--set", text)]
+    words += [word for text in _given(command, "--define", "-D") for word in ("-D", text)]
+    words += ["--size", f"{width}x{height}"]
     words += ["--pretrain", str(row["pretrain_frames"])] if row["pretrain_frames"] else []
     words += ["--seconds", f"{row['budget_seconds']:g}"] if row["budget_seconds"] else ["--spp", f"{row['spp']:g}"]
     return shlex.join([*words, "-o", "picture.png"])
 
 
-def _defines(command: str) -> list[str]:
-    words = shlex.split(command)
-    return [w for k, word in enumerate(words) if word in ("-D", "--define") for w in ("-D", words[k + 1])]
+def _given(command: str, *names: str) -> list[str]:
+    """What was typed for an option of these names, as `--name text`, `--name=text`, `-n text` or `-ntext`."""
+    found, words = [], iter(shlex.split(command))
+    for word in words:
+        if word in names:
+            found.append(next(words))
+        elif name := next((n for n in names if word.startswith(n + "=" if n.startswith("--") else n)), None):
+            found.append(word[len(name) :].removeprefix("="))
+    return found
 
 
 def _figure(pictures: list[Path], caption: str, command: str, wide: bool = False) -> str:
@@ -202,7 +213,11 @@ def main(
     animation: Annotated[Path | None, typer.Option(metavar="FILE.webp", help="the animation alone")] = None,
 ) -> None:
     """Write DIR/index.html."""
-    write(folder, compact, animation)
+    try:
+        write(folder, compact, animation)
+    except (InputError, OSError) as error:
+        print(one_line(error), file=sys.stderr)
+        raise typer.Exit(2) from None
     print(f"wrote {folder / 'index.html'}")
 
 

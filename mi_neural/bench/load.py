@@ -295,6 +295,21 @@ class IntegratorSpec:
         return f"{self.type}:{keys}" if keys else self.type
 
 
+def file_name(label: str) -> str:
+    """The name of what is written for an integrator of this label: `nirc_cache_samples-8`."""
+    return re.sub(r"[^\w.-]+", "_", label.replace("=", "-"))
+
+
+def require_distinct(labels: list[str], of: str) -> None:
+    """Raise :class:`InputError` where two labels have one :func:`file_name`; `of`: what would be shared."""
+    known: dict[str, str] = {}
+    for label in labels:
+        name = file_name(label)
+        if name in known:
+            raise InputError(f"{known[name]!r} and {label!r} would share {of} {name}: leave one of them out")
+        known[name] = label
+
+
 def parse_integrator(text: str) -> IntegratorSpec:
     """Read `type` or `type:key=value,key=value`."""
     name, _, keys = text.partition(":")

@@ -261,10 +261,14 @@ def render_reference(
 
 
 class _Moments:
-    """Mean and squared deviations of passes (Welford). A non-finite pixel counts as the mean of those before it."""
+    """Mean and squared deviations of passes (Welford). A pixel that is not finite in a pass is left out of that pass.
+
+    count   passes of each pixel that count, shape (height, width, 1)
+    """
 
     def __init__(self) -> None:
         self.n = 0
+        self.count: np.ndarray | float = 0.0
         self.size = 1
         self.mean: np.ndarray | float = 0.0
         self.squares: np.ndarray | float = 0.0
@@ -282,6 +286,7 @@ class _Moments:
             return moments  # unreadable: render it anew
         if kept.variance is not None and n >= 2 and kept.metadata.get("pass_spp") == size:
             moments.n, moments.mean = n, kept.rgb.astype(np.float64)
+            moments.count = np.full((*moments.mean.shape[:2], 1), float(n))
             moments.squares = kept.variance.astype(np.float64) * n * (n - 1)
         return moments
 
@@ -289,13 +294,17 @@ class _Moments:
         finite = np.isfinite(image).all(axis=-1, keepdims=True)
         image = np.where(finite, image, self.mean)
         self.n += 1
+        self.count = self.count + finite
         delta = image - self.mean
-        self.mean = self.mean + delta / self.n
+        self.mean = self.mean + delta / np.maximum(self.count, 1.0)
         self.squares = self.squares + delta * (image - self.mean)
+
+    def variance(self) -> np.ndarray:
+        """Variance of the mean."""
+        return self.squares / np.maximum(self.count * (self.count - 1.0), 1.0)
 
     def write(self, path: Path, metadata: dict[str, object]) -> None:
         import mitsuba as mi
 
-        variance = self.squares / (self.n * (self.n - 1))
         metadata = {**metadata, "spp": str(self.n * self.size), "mitsuba": mi.__version__}
-        exr.write(path, self.mean, exr.layer_channels("variance", variance), metadata)
+        exr.write(path, self.mean, exr.layer_channels("variance", self.variance()), metadata)

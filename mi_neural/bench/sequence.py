@@ -15,7 +15,6 @@ change contains the change itself; `smape_reference`, that of the references, sa
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +26,7 @@ from mi_neural.image import exr, metrics
 from . import benchmark, budget, denoise
 from .benchmark import Case, plain
 from .budget import clock
-from .load import InputError, LoadedScene
+from .load import InputError, LoadedScene, file_name, require_distinct
 from .sequence_files import Keeper, frame_path, read_json, write_rows
 from .timeline import References, Sequence, check_frames
 
@@ -109,12 +108,9 @@ class Run:
 
     def check(self, cases: list[Case]) -> None:
         """Raise :class:`InputError` where a case's folder holds frames of other settings, or two share a folder."""
-        folders: dict[Path, str] = {}
+        require_distinct([case.spec.label for case in cases], "the folder")
         for case in cases:
             folder = self.case_folder(case)
-            if folder in folders:
-                raise InputError(f"-i {folders[folder]} and -i {case.spec.label} would share the folder {folder.name}")
-            folders[folder] = case.spec.label
             self._check_settings(folder, self._settings(case))
             self._done(folder)
 
@@ -132,7 +128,7 @@ class Run:
 
     def case_folder(self, case: Case) -> Path:
         """Where a case's frames go."""
-        return self.folder / re.sub(r"[^\w.-]+", "_", case.spec.label.replace("=", "-"))
+        return self.folder / file_name(case.spec.label)
 
     # ----------------------------------------------------------------------------------------------------------------
 
@@ -294,6 +290,8 @@ class Run:
         """All that two runs must have in common for their frames to be of one sequence; the states are in the rows."""
         import mitsuba as mi
 
+        import mi_neural
+
         loaded, plan = self.loaded, self.plan
         settings = {
             "scene": loaded.name,
@@ -307,6 +305,7 @@ class Run:
             "seed": plan.seed,
             "denoise": plan.denoise,
             "variant": mi.variant(),
+            "version": mi_neural.__version__,
             "reference_spp": self.references and self.references.spp,
         }
         return json.loads(json.dumps(plain(settings)))

@@ -98,6 +98,9 @@ class Suite:
         self.interrupted = False
         self._kept: list[kept.Kept] = []
         elsewhere.require_scenes(settings.images, collection.titles(files))
+        # Images of one label are repeats of each other
+        others = dict.fromkeys(image.label for image in settings.images)
+        load.require_distinct([*(spec.label for spec in settings.specs), *others], "the files")
         if len(files) > 1:
             known = {name for file in files for name in load.scene_parameters(file)}
             if unknown := [name for name in settings.parameters if name not in known]:

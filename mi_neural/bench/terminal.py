@@ -94,7 +94,21 @@ def require_writable(file: Path | None) -> None:
         return
     if file.is_dir():
         raise InputError(f"{file} is a folder: give the name of a file in it")
-    require_folder(file.parent)
+    if file.is_file() or not file.exists():  # a pipe or a device is written to as it is
+        require_folder(file.parent)
+
+
+def require_unlike(**files: Path | str | None) -> None:
+    """Raise :class:`InputError` where two options, named as variables are, have the same file."""
+    known: dict[Path, str] = {}
+    for name, file in files.items():
+        path = None if file is None else Path(file).expanduser().resolve()
+        if path is None or (path.exists() and not path.is_file()):
+            continue
+        option = f"--{name.replace('_', '-')}"
+        if path in known:
+            raise InputError(f"{known[path]} and {option} are both {file}: give two files")
+        known[path] = option
 
 
 def require_folder(folder: Path) -> None:
@@ -109,12 +123,16 @@ def require_folder(folder: Path) -> None:
 def require_cache_methods(
     case: benchmark.Case, pretrain: int, save_cache: Path | None, load_cache: Path | None
 ) -> None:
-    for option, asked, method in (
-        ("--pretrain", pretrain, "train"),
-        ("--save-cache", save_cache, "save_cache"),
-        ("--load-cache", load_cache, "load_cache"),
+    """Raise :class:`InputError` where an option would have no effect: the integrator has no cache, or, to be trained,
+    neither one nor a light sampler that learns."""
+    has_cache = hasattr(case.integrator, "save_cache")
+    sampler = getattr(case.integrator, "light_sampler", None)
+    for option, asked, able in (
+        ("--pretrain", pretrain, has_cache or getattr(sampler, "cache", None) is not None),
+        ("--save-cache", save_cache, has_cache),
+        ("--load-cache", load_cache, has_cache),
     ):
-        if asked and not hasattr(case.integrator, method):
+        if asked and not able:
             raise InputError(
                 f"{option}: {case.spec.type} has no cache; choose an integrator that has one, like -i nirc"
             )
@@ -229,9 +247,8 @@ def _write_image(path: Path, row: benchmark.Row, image, rendered: budget.Rendere
 
 def slug(row: benchmark.Row) -> str:
     """A file name for a row: nirc_cache_samples-8_steady_0.25s_denoised_2 (second repeat)."""
-    name = re.sub(r"[^\w.-]+", "_", row.label.replace("=", "-"))
     parts = [
-        name,
+        load.file_name(row.label),
         row.mode,
         f"{row.budget_seconds:g}s" if row.budget_seconds else "",
         "denoised" if row.denoised else "",

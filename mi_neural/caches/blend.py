@@ -50,12 +50,12 @@ class Blend:
         """The grid as it is now, for :meth:`restore`."""
         if self.grid is None:
             return {}
-        return {k: _copies(getattr(self.grid, k)) for k in self.grid.LEARNED}
+        return {k: copies(getattr(self.grid, k)) for k in self.grid.LEARNED}
 
     def restore(self, state: dict) -> None:
         """Take the grid back to a snapshot, and `fast` to what the field holds."""
         for k, v in state.items():
-            setattr(self.grid, k, _copies(v))
+            setattr(self.grid, k, copies(v))
         self.refresh()
 
     # -------------------------------------------------------------------------------------------------------------
@@ -139,5 +139,6 @@ def where_active(active, args: tuple, function, n_outputs: int) -> tuple:
     return dr.if_stmt(args, active, function, nothing, label="predictor")
 
 
-def _copies(value):
-    return [_copies(v) for v in value] if isinstance(value, list) else type(value)(value)
+def copies(value):
+    """Copies of a Dr.Jit array, or of a list of them."""
+    return [copies(v) for v in value] if isinstance(value, list) else type(value)(value)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..estimators import two_level
-from .blend import where_active
+from .blend import copies, where_active
 from .field import Field
 from .incident import IncidentCache, trace_records
 from .reliability import Reliability, ReliabilityGrid, covariance, variance
@@ -53,12 +53,12 @@ class ControlVariate:
     def snapshot(self) -> dict:
         """The statistics as they are now, for :meth:`restore`."""
         values = {k: getattr(self.grid, k) for k in self.grid.LEARNED}
-        return {k: _copies(v) for k, v in {**values, "alpha": self.alpha}.items()}
+        return {k: copies(v) for k, v in {**values, "alpha": self.alpha}.items()}
 
     def restore(self, state: dict) -> None:
         """Take the statistics back to a snapshot."""
         for k, v in state.items():
-            setattr(self if k == "alpha" else self.grid, k, _copies(v))
+            setattr(self if k == "alpha" else self.grid, k, copies(v))
 
     # -----------------------------------------------------------------------------------------------------------------
 
@@ -133,7 +133,3 @@ class ControlCache(IncidentCache):
         self.check()
         self._measure = float(value[0])
         return self._measure
-
-
-def _copies(value):
-    return [_copies(v) for v in value] if isinstance(value, list) else type(value)(value)

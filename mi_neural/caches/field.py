@@ -12,6 +12,7 @@ import numpy as np
 from . import encoding, files
 from .files import FILE_VERSION, CacheFileError
 from .optimizer import Stride, attach_adam, descend, moments_of, own_copy, set_moments
+from .voxels import check_box
 from .weights import FieldShape, Weights, shortcut
 
 __all__ = ["FILE_VERSION", "CacheFileError", "Field", "TrainedField"]
@@ -209,8 +210,7 @@ class Field(TrainedField):
         self.shape = shape or FieldShape()
         self.seed = seed
         box_min, box_max = np.asarray(box_min, np.float64), np.asarray(box_max, np.float64)
-        if not (np.isfinite(box_min).all() and np.isfinite(box_max).all() and (box_max > box_min).all()):
-            raise ValueError(f"the box {box_min.tolist()} .. {box_max.tolist()} is empty or not finite")
+        check_box(box_min, box_max)
         if not (np.isfinite(scale) and scale > 0):
             raise ValueError(f"scale is {scale}; it must be a positive number")
         self.box = (box_min.tolist(), box_max.tolist())

@@ -32,8 +32,10 @@ from .weights import FieldShape
 
 #: Targets above this many times the scene's mean are cut (the authors clamp the cache to [0, 1e4]).
 TARGET_MAX = 1e4
-#: Targets are cut to this share of outliers when the scene's mean is measured.
+#: Share of the largest targets that is left out when the scene's mean is measured.
 SCALE_TRIM = 1e-3
+#: Scale of a field where no light was found: it answers with nothing.
+NOTHING = 1e-20
 #: Share of the training paths that start where records lay, if that place has left the view.
 WORLD_SHARE = 0.25
 #: What training lessens; the second is the authors'.
@@ -230,6 +232,17 @@ def _errors(field: Field, records: TrainingRecords, training: Training, seed, p,
     return loss.local_relative_l2(p, y, dr.maximum(limited, LEAST_LOCAL * mean_local), epsilon)
 
 
+def scale_of(targets: np.ndarray) -> float:
+    """Mean of the `targets` (n,) of a probe without the largest `SCALE_TRIM` of them, or with these where all others
+    are black; `NOTHING` without light."""
+    targets = np.sort(targets)
+    for some in (targets[: max(1, int(targets.size * (1 - SCALE_TRIM)))], targets):
+        mean = float(some.mean()) if some.size else 0.0
+        if NOTHING < mean < math.inf:
+            return mean
+    return NOTHING
+
+
 class IncidentCache(Trainer):
     """A field of incident radiance together with its training: start, train, watch, recover.
 
@@ -310,13 +323,11 @@ class IncidentCache(Trainer):
             target = np.array(records.target).T[valid].mean(axis=-1)
         box = scene.bbox()
         low, high = encoding.record_box(points, np.array(box.min).ravel(), np.array(box.max).ravel())
-        scale = 0.0
-        if target.size:
-            scale = float(np.sort(target)[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
-        if not (math.isfinite(scale) and scale > 1e-30):
-            scale = 1e-20  # no indirect light found: the cache answers with nothing
-        self.field, self.ages = self.make_field(low, high, scale), Ages(low, high)
+        self.field, self.ages = self.make_field(low, high, scale_of(target)), Ages(low, high)
         dr.eval(self.field)
+
+    def found_no_light(self) -> bool:
+        return float(self.field.scale[0]) <= NOTHING
 
     def train_step(self, scene, sensor, lights=None) -> None:
         """Trace fresh records and take one step on them."""

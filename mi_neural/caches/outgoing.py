@@ -8,7 +8,6 @@ it in a scene. For renderers of your own: :class:`~mi_neural.caches.radiance_cac
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,7 +20,7 @@ from ..render.surface import scene_is_glossy
 from ..render.walk import SURFACES, SurfaceWalk
 from . import encoding, loss
 from .blend import OutgoingBlend
-from .incident import SCALE_TRIM, IncidentCache, Training
+from .incident import IncidentCache, Training, scale_of
 from .outgoing_field import OutgoingField, OutgoingShape, reflectance
 from .places import N_PLACES
 from .records import packed
@@ -228,10 +227,6 @@ class OutgoingCache(IncidentCache):
         low, high = encoding.record_box(points.T[valid], *whole)
         if self.training.world_share > 0 and not self.walk.in_media:
             low, high = _reaching(low, high, *whole)
-        target, scale = np.sort(target[valid]), 0.0
-        if target.size:
-            scale = float(target[: max(1, int(target.size * (1 - SCALE_TRIM)))].mean())
-        if not (math.isfinite(scale) and scale > 1e-20):
-            scale = 1e-20  # no light found: the cache answers with nothing
+        scale = scale_of(target[valid])
         self.field, self.ages = OutgoingField(low, high, self.shape, scale=scale, seed=self.seed), Ages(low, high)
         dr.eval(self.field)

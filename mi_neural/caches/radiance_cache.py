@@ -40,7 +40,7 @@ class DispatchFlags(enum.Flag):
 class CacheInput:
     """Surface points for a :class:`RadianceCache`, as Dr.Jit arrays; make them with :meth:`RadianceCache.pack`.
 
-    position   over the box: [0, 1]^3
+    position   over the box: [0, 1]^3 inside
     normal     polar angles (θ from +z, φ from +x) of the shading normal on the viewer's side, radians
     view_dir   of the direction towards the viewer
     albedo     diffuse and specular reflectance together, RGB
@@ -82,7 +82,7 @@ class RadianceCache:
     """A neural radiance cache for a renderer of your own, with the interface of AMD's "FSR Radiance Caching" guide.
 
     Parameters: `max_inference_sample_count`, `max_training_sample_count` (per dispatch), `box_min`, `box_max` (the
-    scene's, world space; what lies outside is moved to its surface), `scale` (see :class:`OutgoingField`; None:
+    scene's, world space; points may lie outside), `scale` (see :class:`OutgoingField`; None:
     measured on the first training samples, and until then predictions are 0), `shape`, `seed`, `preset` (``measured``
     or ``paper``, see below; a `shape` goes before it). Raises ValueError for values that make no sense.
 

@@ -21,6 +21,7 @@ from . import encoding, loss
 from .field import TrainedField
 from .incident import TARGET_MAX, IncidentCache
 from .optimizer import own_copy
+from .voxels import check_box
 
 #: Means reach back this many times as far as averaged weights do: they have no other way to be rid of noise.
 MEMORY = 6.0
@@ -80,8 +81,7 @@ class SpatialHash(TrainedField):
     def __init__(self, box_min, box_max, shape: HashShape | None = None, *, scale: float = 1.0, seed: int = 0):
         self.shape, self.seed = shape or HashShape(), seed
         box_min, box_max = np.asarray(box_min, np.float64), np.asarray(box_max, np.float64)
-        if not (np.isfinite(box_min).all() and np.isfinite(box_max).all() and (box_max > box_min).all()):
-            raise ValueError(f"the box {box_min.tolist()} .. {box_max.tolist()} is empty or not finite")
+        check_box(box_min, box_max)
         if not (np.isfinite(scale) and scale > 0):
             raise ValueError(f"scale is {scale}; it must be a positive number")
         self.box = (box_min.tolist(), box_max.tolist())

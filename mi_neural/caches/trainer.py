@@ -51,8 +51,9 @@ class Trainer:
     #: Mean predictions this many times the latest mean targets are an explosion. Healthy training stayed below 1.3 in
     #: seven scenes from their first step on (1024 paths, 200 steps); all weights times 100 give 10^5.
     EXPLOSION = 10.0
-    #: Targets this many times the brightness that the field was made for: it is made anew.
-    BRIGHTER = 100.0
+    #: Mean targets this many times the brightness that the field was made for: it is made anew. Where that is nothing,
+    #: a lit target counts 1e4 (`TARGET_MAX`), and one that ends in the untrained field 1.
+    BRIGHTER, BRIGHTER_THAN_NOTHING = 100.0, 1.0
     #: Steps between snapshots that a divergence is undone with.
     SNAPSHOT_EVERY = 64
     #: Steps of a frame while the camera is in new places: 30 frames then do as much as for a cache that is new itself.
@@ -192,6 +193,7 @@ class Trainer:
         rows = np.array(dr.concat(self._unread)).reshape(len(self._unread), -1)
         self._unread.clear()
         first = self.steps - len(rows) + 1
+        brighter = self.BRIGHTER_THAN_NOTHING if self.found_no_light() else self.BRIGHTER
         for k, row in enumerate(rows.tolist()):
             loss, mean_target, mean_prediction, n_records, n_bad, measure, total, novelty = row
             counts = self._counts
@@ -207,7 +209,7 @@ class Trainer:
             self._history.append(loss)
             self._levels = [*self._levels[-31:], mean_target]
             self._novel = Ages.is_novel(total, novelty)
-            if mean_target > max(self.BRIGHTER, 10 * mean_prediction):
+            if mean_target > max(brighter, 10 * mean_prediction):
                 # What was measured in the old light is void, and the schedule of rates begins anew
                 mi.Log(mi.LogLevel.Info, "mi_neural: the scene became brighter by far; the cache starts anew")
                 counts["steps"] += len(rows) - k - 1
@@ -220,6 +222,10 @@ class Trainer:
                 if all(np.isfinite(w).all() for w in weights.values()):
                     self._good = weights
         self._counts["seconds"] += time.perf_counter() - t0
+
+    def found_no_light(self) -> bool:
+        """Whether the field was made for a scene in which no light was found."""
+        return False
 
     def _healthy(self, loss: float, mean_prediction: float) -> bool:
         """Whether training goes on well. Divergence: numbers that are not finite, among them the loss of a step that
@@ -289,6 +295,8 @@ class Trainer:
                     progress(done, frames if frames is not None else at_most)
         if frames != 1:
             self.check()
+            if self.field is None:  # the last steps were in another light
+                self.start(*args)
 
     # -------------------------------------------------------------------------------------------------------------
     # State

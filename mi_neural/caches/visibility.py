@@ -237,7 +237,8 @@ class VisibilityCache(Trainer):
         with dr.suspend_grad():
             n = 2**13
             lane = dr.arange(mi.UInt32, n)
-            sampler = PathSampler.make(lane, mi.UInt32(self.seed), index=lane, scramble=mi.UInt32(self.seed))
+            seed = mi.UInt32(self.seed & 0xFFFFFFFF)
+            sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
             ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, sampler.stratified_2d(0), sampler.next_2d())
             p, normal, valid = surface_point(scene, mi.Ray3f(ray.o, ray.d), mi.Bool(True))
             wo = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))

@@ -103,6 +103,8 @@ def render(
     if until_error is not None and getattr(case.integrator, "cumulative", False):
         raise InputError("--until-error compares passes, but images of this integrator hold all passes before them")
     output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
+    for more in ({"load_cache": load_cache}, {"save_cache": save_cache}):  # a cache may be written back
+        terminal.require_unlike(reference=reference, output=output, json=json_, **more)
     ref = references.of_film(reference, loaded) if reference else None
     terminal.depth_notes(ref, loaded, [case])
     if ref is not None and (note := references.scale_note(ref, loaded.size)):
@@ -170,8 +172,9 @@ def render(
             rendered.interrupted = True
         elif until_error is not None:
             bar = bars(f"rendering until the error is {until_error:g}")
+            left = None if seconds is None else max(seconds - seconds_first, 0.0)  # training counts
             rendered, estimate = budget.render_until(
-                loaded.scene, case.integrator, until_error, seconds, seed, progress=bar, keep=keep
+                loaded.scene, case.integrator, until_error, left, seed, progress=bar, keep=keep
             )
         elif seconds is not None:
             rendered = budget.render_seconds(

@@ -173,8 +173,17 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike):
-    """Hand out a temporary path beside `path`; on success it takes that name, on an exception it is removed."""
+    """Hand out a temporary path beside `path`; on success it takes that name, on an exception it is removed.
+
+    Where `path` is a link, what it leads to is replaced; what is no file (a pipe, ``/dev/null``) is written to.
+    """
     path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        with tempfile.TemporaryDirectory(prefix="mi-neural-") as folder:
+            yield (temporary := Path(folder) / path.name)
+            path.write_bytes(temporary.read_bytes())
+        return
+    path = Path(os.path.realpath(path))
     # A suffix of its own keeps what libraries derive from it; hidden, so that nobody takes it for a result
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)

@@ -189,10 +189,10 @@ def _look(columns, scene, emitters, rows: list[int], rng) -> None:
         lamp, bright = _look_at(columns, scene, batch, mine, u)
         lamps += lamp
         glow += bright
-    # A lamp that was dark in all sampled directions may be a narrow beam
-    least = 1e-3 * max([0.0, *glow, float(columns["intensity"].max())])
+    # A lamp that was dark in all sampled directions may be a narrow beam, also where nothing else gives light
+    least = 1e-3 * max([0.0, *np.nan_to_num(glow), float(columns["intensity"].max())])
     for row, bright in zip(lamps, glow, strict=True):
-        columns["intensity"][row] = bright if bright > 0 else least
+        columns["intensity"][row] = bright if bright > 0 else least if np.isnan(bright) else least or 1.0
 
 
 def _look_at(columns, scene, rows: list[int], emitters: list, u) -> tuple[list, list]:
@@ -273,7 +273,8 @@ def _area(shape) -> float:
 
 
 def _glow(lamps, places: np.ndarray) -> np.ndarray:
-    """Radiant intensity of lamps without extent in the brightest of 1024 directions."""
+    """Radiant intensity of lamps without extent in the brightest of 1024 directions; NaN of one that is not finite and
+    nowhere bright."""
     m, k = len(places), 1024
     i = np.arange(k) + 0.5
     z, phi = 1 - 2 * i / k, i * np.pi * (3 - np.sqrt(5))  # a spiral of equal steps
@@ -284,7 +285,9 @@ def _glow(lamps, places: np.ndarray) -> np.ndarray:
         lamps = dr.gather(mi.EmitterPtr, lamps, dr.repeat(dr.arange(mi.UInt32, m), k))
     _, weight = lamps.sample_direction(it, mi.Point2f(0.5), True)
     weight = np.array(as_three(weight) + dr.zeros(mi.Color3f, m * k), np.float64).T.reshape(m, k, 3)
-    return np.nan_to_num(weight, posinf=0, neginf=0).mean(axis=2).max(axis=1)
+    finite = np.isfinite(weight)
+    bright = np.where(finite, weight, 0).mean(axis=2).max(axis=1)
+    return np.where((bright > 0) | finite.all(axis=(1, 2)), bright, np.nan)
 
 
 def seen_from(p):
@@ -375,6 +378,7 @@ def _merge_rectangles(columns, counts, is_mesh) -> dict[str, np.ndarray]:
     q1, q2 = one[rows, (i1 + 1) % 3], one[rows, (i1 + 2) % 3]
     ok &= np.linalg.norm(q1 + q2 - corner - opposite, axis=1) < 1e-4 * scale
     ok &= columns["plain"][a] & columns["plain"][a + 1]
+    ok &= (columns["normal"][a] * columns["normal"][a + 1]).sum(axis=1) > 0  # both shine to the same side
     ok &= np.abs(columns["radiance"][a] - columns["radiance"][a + 1]).max(axis=1) <= 1e-5 * columns["radiance"][a].max(
         axis=1
     )

@@ -19,6 +19,8 @@ SIZES = (32, 512)
 LOOKS = 2**20
 #: Points of a texel lie within this angle of its centre, over R (measured: 3.54; see the tests).
 REACH = 4.0
+#: Points on the environment lie so many times the scene's size away: beyond whatever moves outwards in it later.
+BEYOND = 1e4
 #: A texel whose samples were dark counts as this share of the mean, so that nothing bright is left out.
 DARK = 1e-3
 
@@ -63,7 +65,8 @@ class Sky:
         self.emitter, self.size, self.first = emitter, _size(environment), 0
         self.solid_angle = 4 * np.pi / self.size**2
         extent = np.array(scene.bbox().extents(), np.float64).ravel()
-        self.distance = float(2 * np.linalg.norm(extent)) if np.isfinite(extent).all() and extent.any() else 2.0
+        size = float(np.linalg.norm(extent)) if np.isfinite(extent).all() and extent.any() else 1.0
+        self.distance = BEYOND * size
         n = self.size**2
 
         # Stratified samples of every texel, and the environment's own samples, which find what is small and bright

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_neural.bench import benchmark, budget, load, plots, sequence
+from mi_neural.bench import benchmark, budget, load, sequence, sequence_pictures
 from mi_neural.bench.load import IntegratorSpec
 from mi_neural.caches.reliability import correlation, covariance, variance
 from mi_neural.image import exr, metrics
@@ -100,7 +100,7 @@ class Measured:
     results: dict[str, sequence.Result]
     direct: dict[str, np.ndarray]
     curves: dict[str, dict[str, list[float | None]]]
-    crops: list[plots.Crop]
+    crops: list[sequence_pictures.Crop]
 
     def clean(self, method: str, frame: int) -> np.ndarray:
         """A frame with the mean of direct light in place of its sample, shape (height, width, 3)."""
@@ -157,7 +157,7 @@ def measure(work: Work, settings: Settings, change: Change, common: dict[str, ob
     direct = {state: direct_light(still, loaded, over_time, settings, frame)
               for state, frame in run.references.first.items()}  # fmt: skip
     found = Measured(settings, run, results, direct, {}, [])
-    found.crops = plots.choose_crops(found.reference(CHANGE - 1), found.reference(CHANGE))
+    found.crops = sequence_pictures.choose_crops(found.reference(CHANGE - 1), found.reference(CHANGE))
     found.curves = {m: group.part(f"errors_{m}", lambda bar, m=m: Part(_errors(found, m, bar))).numbers
                     for m in settings.methods}  # fmt: skip
     return found
@@ -200,7 +200,7 @@ def _errors(found: Measured, method: str, bar) -> dict[str, list[float | None]]:
     return errors
 
 
-def cut(image: np.ndarray, crop: plots.Crop) -> np.ndarray:
+def cut(image: np.ndarray, crop: sequence_pictures.Crop) -> np.ndarray:
     """The part of an image or map that a crop (x, y, width, height) names."""
     x, y, w, h = crop
     return image[y : y + h, x : x + w]

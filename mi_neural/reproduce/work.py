@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -47,10 +48,11 @@ class Group:
             numbers = json.loads(path.read_text(encoding="utf-8"))
             arrays = {}
             if path.with_suffix(".npz").is_file():
-                with np.load(path.with_suffix(".npz")) as kept:
+                # Opened here: np.load() leaves a damaged file open
+                with open(path.with_suffix(".npz"), "rb") as file, np.load(file) as kept:
                     arrays = dict(kept)
             return Part(numbers, arrays)
-        except (OSError, ValueError):
+        except (OSError, ValueError, zipfile.BadZipFile):
             pass  # not there, or damaged: it is measured
         # Scenes and integrators of earlier parts refer to each other in circles. As long as they are there, they are
         # compiled into the kernels of this part, and they could be freed at any moment of it
