@@ -120,6 +120,13 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
      * - combination
        - |string|
        - ``unbiased`` or ``biased``, see above. (Default: unbiased)
+     * - max_depth
+       - |int|
+       - Of a scene made for ``path``. Light reflected once is all that is rendered: -1 and numbers above 2 do what 2
+         does, and warn; 0 and 1 are refused. (Default: 2)
+     * - rr_depth
+       - |int|
+       - Of a scene made for ``path``; no path is long enough for it to matter. (Default: 5)
      * - hide_emitters
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
@@ -164,6 +171,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props.props)
         self.hide, self.max_depth = props.get("hide_emitters", False), 2
+        self._check_depth(props.get("max_depth", 2))
+        props.get("rr_depth", 5)
         self.light_sampler = light_sampler_of(props)
         self.candidates = props.get("candidates", "light" if self.light_sampler is None else "nvc")
         self.preset = props.get("preset", "measured")
@@ -204,6 +213,16 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def _check(self, ok: bool, message: str) -> None:
         if not ok:
             raise ValueError(f"restir_di: {message}")
+
+    def _check_depth(self, asked: int) -> None:
+        """Refuse a `max_depth` that leaves out direct light; say what another one leaves out here."""
+        self._check(
+            asked == -1 or asked >= 2,
+            f"max_depth is {asked}; it renders direct light: give 2, or take path with that max_depth",
+        )
+        if asked != 2:
+            mi.Log(mi.LogLevel.Warn, f"mi_neural: restir_di renders light reflected once (max_depth 2, not {asked}); "
+                   "neural_path, nirc and plain_path render all")  # fmt: skip
 
     def reset(self) -> None:
         """Forget the frames before, and what a light sampler has learned. Compiled kernels are kept."""
@@ -373,7 +392,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     # -------------------------------------------------------------------------------------------------------------
 
     render_backward = render_forward = refuse_gradients
-    plugin = "restir_di"
+    plugin, direct_only = "restir_di", True
 
     def statistics(self) -> dict:
         """Facts since the last reset: frames, and what the light sampler says of itself."""

@@ -1,11 +1,14 @@
 """Images come back as they were written, whole or not at all."""
 
 import io
+import os
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from mi_neural.bench import terminal
+from mi_neural.caches import files
 from mi_neural.image import exr
 
 
@@ -62,6 +65,20 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
         raise RuntimeError
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/null"), reason="no /dev/null")
+def test_devices_and_links_are_written_to_and_not_replaced(tmp_path, rgb):
+    """As root, ``--json /dev/null`` made a file of the device, and every program of the machine failed after that."""
+    device, link, target = (tmp_path / name for name in ("null.exr", "link.txt", "target.txt"))
+    device.symlink_to("/dev/null")
+    link.symlink_to(target)
+    exr.write(device, rgb)
+    exr.write_text(link, "new")
+    files.write(device, "incident", {}, {"a": rgb})
+    assert device.is_symlink() and device.is_char_device() and link.is_symlink() and target.read_text() == "new"
+    terminal.require_writable(device)
+    assert sorted(tmp_path.iterdir()) == [link, device, target]
 
 
 def test_bad_input_is_refused(tmp_path, rgb):

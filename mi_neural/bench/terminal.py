@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import tempfile
@@ -94,7 +95,10 @@ def require_writable(file: Path | None) -> None:
         return
     if file.is_dir():
         raise InputError(f"{file} is a folder: give the name of a file in it")
-    require_folder(file.parent)
+    if not exr.is_special(file):
+        require_folder(file.parent)
+    elif not os.access(file, os.W_OK):
+        raise InputError(f"cannot write to {file}")
 
 
 def require_folder(folder: Path) -> None:
@@ -128,7 +132,9 @@ def depth_notes(
     for case in cases if reference is not None else []:
         if "max_depth" not in case.keys and "max_depth" in loaded.carried:
             continue  # it has no such key
-        if text := references.depth_warning(reference, case.keys.get("max_depth", -1)):
+        depth = getattr(case.integrator, "max_depth", case.keys.get("max_depth", -1))
+        direct = getattr(case.integrator, "direct_only", False)
+        if text := references.depth_warning(reference, depth, direct):
             notes.append(f"{case.spec.label}: {text}")
             announce(f"warning: {notes[-1]}")
     return notes

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_neural.image.exr import replacing
+
 #: Changes when a file written before cannot be read any more.
 FILE_VERSION = 4
 #: What is said of a file that is not of the kind asked for.
@@ -32,18 +34,12 @@ def write(path, kind: str, header: dict, arrays: dict[str, np.ndarray]) -> None:
 
     Raises ``OSError`` where that fails; a file of that name that was there before is then still there.
     """
-    path = Path(path)
     sizes = {name: list(values.shape) for name, values in arrays.items()}
     text = json.dumps({**header, "kind": kind, "version": FILE_VERSION, "arrays": sizes})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, header=np.frombuffer(text.encode(), np.uint8), **arrays)
-            file.flush()
-            os.fsync(file.fileno())  # the name must not outlive the content
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, header=np.frombuffer(text.encode(), np.uint8), **arrays)
+        file.flush()
+        os.fsync(file.fileno())  # the name must not outlive the content
 
 
 def read(path, kind: str, unknown: tuple[str, ...] = ()) -> tuple[dict, dict[str, np.ndarray]]:
