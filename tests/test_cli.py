@@ -15,6 +15,7 @@ from test_benchmark import KEYS, WHITE, boxes, has_denoiser
 from typer.testing import CliRunner
 
 from mi_neural import scenes
+from mi_neural.bench import load
 from mi_neural.cli import app
 from mi_neural.image import exr
 
@@ -59,6 +60,35 @@ def test_scene_whose_meshes_cannot_be_joined_is_rendered(tmp_path):
     plane, flipped = (f'<shape type="{kind}"> {WHITE} </shape>' for kind in ("rectangle", "cube"))
     flipped = flipped.replace(WHITE, f'<boolean name="flip_normals" value="true"/> {WHITE}')
     run("render", boxes(tmp_path / "b.xml", plane, flipped), *SMALL, "-i", "path", "--spp", 1, "-o", "a.exr")
+
+
+def small_scene(integrator: str, n_balls: int = 1) -> str:
+    sensor = '<sensor type="perspective"> <film type="hdrfilm"/> </sensor>'
+    lamp = '<shape type="rectangle"> <emitter type="area"/> </shape>'
+    balls = '<shape type="sphere"/>' * n_balls
+    Path("a.xml").write_text(f'<scene version="3.0.0"> {integrator} {sensor} {lamp} {balls} </scene>')
+    return "a.xml"
+
+
+def test_depth_of_a_small_scene():
+    """Joining its meshes moved the parsed parts in memory; the process ended where its integrator's keys were read."""
+    for n in range(8):
+        file = small_scene('<integrator type="path"> <integer name="max_depth" value="3"/> </integrator>', n)
+        loaded = load.load_scene(file)
+        assert loaded.carried == {"max_depth": 3} and loaded.integrator == "path"
+
+
+def test_scene_that_names_no_integrator_is_rendered_by_path():
+    run("render", small_scene(""), *SMALL, "--spp", 1, "--json", "a.json")
+    assert facts_of("a.json")["integrator"] == "path"
+
+
+def test_scene_without_surfaces(tmp_path):
+    sensor = '<sensor type="perspective"> <film type="hdrfilm"/> </sensor>'
+    Path("a.xml").write_text(f'<scene version="3.0.0"> {sensor} <emitter type="constant"/> </scene>')
+    for name in ("nirc_two_level", "neural_path"):
+        run("render", "a.xml", *SMALL, "-i", name, "--spp", 1, "--json", "a.json")
+        assert facts_of("a.json")["mean"] == pytest.approx(1)
 
 
 def test_scene_is_a_name_or_a_file_and_sizes_fit():
