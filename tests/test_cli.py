@@ -260,6 +260,8 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "--variant", "llvm_rgb"), "unknown variant 'llvm_rgb'; available: .*llvm_ad_rgb"),
         ((*RENDER, "-o", "a.jpg"), "ends in .exr or .png"),
         ((*RENDER, "-o", "file/a.exr"), "cannot write to the folder file"),
+        ((*RENDER, "-o", "a.exr", "--json", "./a.exr"), "-o and --json name the same file"),
+        ((*RENDER, "-o", "other.exr", "--reference", "other.exr"), "-o and --reference name the same file"),
         ((*RENDER, "--json", "file/a.json"), "cannot write to the folder file"),
         ((*RENDER, "--reference", "no.exr"), "no reference no.exr"),
         ((*RENDER, "--reference", "file"), "not a readable EXR"),

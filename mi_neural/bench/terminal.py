@@ -101,6 +101,16 @@ def require_writable(file: Path | None) -> None:
         raise InputError(f"cannot write to {file}")
 
 
+def require_different(files: dict[str, Path | None]) -> None:
+    """Refuse two options that name one file, which the later would overwrite."""
+    seen: dict[Path, str] = {}
+    for option, file in files.items():
+        if file is None or exr.is_special(file):
+            continue
+        if (first := seen.setdefault(file.resolve(), option)) != option:
+            raise InputError(f"{first} and {option} name the same file, {file}: give each its own")
+
+
 def require_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -103,6 +103,8 @@ def render(
     if until_error is not None and getattr(case.integrator, "cumulative", False):
         raise InputError("--until-error compares passes, but images of this integrator hold all passes before them")
     output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
+    given = {"-o": output, "--json": json_, "--save-cache": save_cache}
+    terminal.require_different({**given, "--reference": Path(reference) if reference else None})
     ref = references.of_film(reference, loaded) if reference else None
     terminal.depth_notes(ref, loaded, [case])
     if ref is not None and (note := references.scale_note(ref, loaded.size)):
