@@ -361,6 +361,9 @@ def build_integrator(
             continue
         if wrong := [k for k in unknown if k not in dropped]:
             raise InputError(f"{spec.type} has no key {', '.join(map(repr, wrong))}")
+        if "is not a light sampler" in text:
+            raise InputError(f"{spec.label}: name the light sampler by light_sampler.type, as in "
+                             f"-i {spec.type}:light_sampler.type=tree_lights")  # fmt: skip
         text = re.sub(r'^At dictionary node "\w+": failed to instantiate .*? of type "\w+": ', "", text)
         raise InputError(f"cannot make the integrator {spec.label!r}: {text}")
     if not isinstance(integrator, mi.Integrator):
