@@ -84,7 +84,7 @@ class LightSampler(mi.Emitter):
             self.reset()
             self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
-            self.edits = _edits_of(scene) if self.plan.modelled("light_sampler") else None
+            self.edits = edits_of(scene) if self.plan.modelled("light_sampler") else None
         if self.edits is None:
             return None
         with dr.suspend_grad():
@@ -128,7 +128,7 @@ class LightSampler(mi.Emitter):
         return dr.zeros(mi.Wavelength), mi.Spectrum(0)
 
 
-def _edits_of(scene) -> parameters.Edits:
+def edits_of(scene) -> parameters.Edits:
     """Edits of the parameters that the table is made of."""
     pairs = []
     for emitter in scene.emitters():

@@ -2,9 +2,9 @@
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_neural.caches import presets
+from mi_neural.emitters.common import edits_of
 from mi_neural.integrators import restir_reuse as reuse
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import refuse_gradients
@@ -34,7 +34,7 @@ class _State:
     def __init__(self):
         self.frames: dict = {}  # recorded functions
         self.freeze = True
-        self.chooser = self.power = None
+        self.chooser = self.power = self.edits = None
         self.key: tuple = ()
         self.reset()
 
@@ -269,7 +269,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             check_scene(scene, "restir_di")
             s.reset()
             s.frames.clear()
-            s.key, s.freeze = key, can_freeze_scene(scene)
+            s.key, s.freeze, s.edits = key, can_freeze_scene(scene), None
 
         lights, facts = self._lights(scene, recordable(sensor, s.frame))
         camera, pinhole = camera_of(sensor)
@@ -305,10 +305,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             )
         lights = s.chooser.lights(scene, sensor)
         if lights is None:  # a single light, which light samplers do not watch
-            table = LightTable(scene)
-            known = s.power.table.columns if s.power is not None else {}
-            same = known and all(np.array_equal(v, known[k]) for k, v in table.columns.items())
-            lights = s.power if same else PowerLights(table)
+            s.edits = s.edits or edits_of(scene)
+            lights = PowerLights(LightTable(scene)) if s.edits.changed() or s.power is None else s.power
         if s.power is None or s.power.table is not lights.table:
             s.power = lights if isinstance(lights, PowerLights) else PowerLights(lights.table)
         facts = (type(lights).__name__, _facts(lights.table), getattr(lights, "candidates", None))
