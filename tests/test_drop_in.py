@@ -114,6 +114,17 @@ def test_batch_and_irradiance_meter(name):
     agree(name, images(scene, INTEGRATORS[name]), images(scene, {"type": "path"}, first=100))
 
 
+@pytest.mark.parametrize("keys", [{"type": "plain_path", "max_depth": 2}, {"type": "restir_di"}])
+def test_batch_sensor_that_was_asked_for_rays_before(keys):
+    """It keeps numbers of the last rays, and the process ended where a recording freed them."""
+    view = {k: v for k, v in camera().items() if k != "film"}
+    scene = room(sensor={"type": "batch", "a": view, "b": {**view, "fov": 20}, "film": film(16, 8)})
+    places = mi.Point2f(np.float32([0.2, 0.7]), np.float32([0.3, 0.4]))
+    dr.eval(scene.sensors()[0].sample_ray_differential(0.0, 0.5, places, mi.Point2f(0.5)))
+    path = images(scene, {"type": "path", "max_depth": 2}, spp=256, n=1).mean()
+    assert abs(images(scene, keys, spp=32, n=1).mean() / path - 1) < 0.1
+
+
 def test_one_recording_serves_many_views():
     scene, integrator = room(sensor=None), mi.load_dict(INTEGRATORS["plain_path"])
     for k in range(6):

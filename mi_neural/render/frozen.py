@@ -27,11 +27,12 @@ def can_freeze(sensor) -> bool:
     """Whether Dr.Jit can freeze a function of this sensor; tried once for each kind of sensor.
 
     Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold, and `irradiancemeter` has no
-    ``sample_ray``; rays of theirs are made outside of recorded functions.
+    ``sample_ray``; rays of theirs are made outside of recorded functions. So are those of `batch`, which keeps which of
+    its sensors were last asked: to free that in a recording ends the process.
     """
-    if is_special(sensor) or special_films():
+    if is_special(sensor) or special_films() or sensor.class_name() == "BatchSensor":
         return False
-    key = mi.variant(), sensor.class_name(), str(sensor) if sensor.class_name() == "BatchSensor" else ""
+    key = mi.variant(), sensor.class_name()
     if key not in _freezes:
         _freezes[key] = _records(_ray_of, sensor)
     return _freezes[key]
