@@ -16,7 +16,7 @@ from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.film import Area, camera_rays, coverage, recordable
+from mi_neural.render.film import Area, camera_rays, coverage, put_in_reach, recordable
 from mi_neural.render.frozen import LOCK, call, can_freeze, can_freeze_scene, is_recording
 from mi_neural.render.sampling import PathSampler
 
@@ -359,7 +359,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             if self.state.alpha:
                 values.append(coverage(valid))
             values.append(dr.select(ok, mi.Float(1), 0))
-            pos = (area.corner(pixel) + 0.5 if area.box else pos) + mi.Point2f(mi.ScalarPoint2f(area.offset))
+            pos, values = put_in_reach(area, area.corner(pixel) + 0.5 if area.box else pos, values)
+            pos = pos + mi.Point2f(mi.ScalarPoint2f(area.offset))
             past = Past(kept, si, usable)
             dr.eval(pos, values, past)
             return pos, values, past

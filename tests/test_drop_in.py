@@ -14,6 +14,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_neural.render.film import Area, put_in_reach
+
 T = mi.ScalarTransform4f
 SMALL = {"train_frames": 32, "train_samples": 512}
 INTEGRATORS = {
@@ -143,6 +145,19 @@ def test_crop_window_that_moves_is_no_new_recording():
         part = images(scene, integrator, view, 256, 1)[0]
         assert abs(part.mean() / whole[:, x : x + 4].mean() - 1) < 0.1
     assert len(integrator.film_state.passes.recorded) == 2
+
+
+@pytest.mark.parametrize("keys", [{"type": "plain_path", "max_depth": 2}, {"type": "restir_di"}])
+def test_samples_in_the_border_that_reach_no_pixel(keys):
+    """Mitsuba wrote beside the image for them, and the process ended."""
+    lanczos = {"rfilter": {"type": "lanczos"}, "sample_border": True}
+    view = camera(film=film(8, 4, **lanczos))
+    assert np.isfinite(images(room(sensor=view), keys, spp=16, n=4)).all()
+    area = Area.of(mi.load_dict(view))
+    places = mi.Point2f([-2.9, -2.4, 10.6, 4.0], [1.0, 1.0, 1.0, 6.6])
+    assert (area.border, area.radius) == (3, 3.0) and list(area.reaches(places)) == [False, True, False, False]
+    place, (one,) = put_in_reach(area, places, [mi.Float(1)])
+    assert list(one) == [0, 1, 0, 0] and np.array(place)[:, 0].tolist() == [0.5, 0.5]
 
 
 # ---------------------------------------------------------------- coverage and what is hidden
