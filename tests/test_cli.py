@@ -14,6 +14,7 @@ from fake_cache import register
 from test_benchmark import KEYS, WHITE, boxes, has_denoiser
 from typer.testing import CliRunner
 
+import mi_neural
 from mi_neural import scenes
 from mi_neural.bench import load
 from mi_neural.cli import app
@@ -224,6 +225,11 @@ def test_another_depth_than_the_references_is_said():
     exr.write("r.exr", exr.read("r.exr").rgb, metadata={"max_depth": "64"})
     result = run("render", "cornell_box", *SMALL, "-i", "path:max_depth=3", "--spp", 1, "--reference", "r.exr")
     assert "max_depth is 3, the reference was rendered with 64" in result.output
+
+
+def test_help_and_version_are_where_they_are_expected():
+    assert run("--version").output.strip() == mi_neural.__version__
+    assert "Commands:" in run("-h").output and "--until-error" in run("render", "-h").output
 
 
 def test_info_names_versions_and_llvm():
