@@ -82,7 +82,7 @@ class LightSampler(mi.Emitter):
             self.reset()
             self.sampler = None
             self.plan = self.make_plan(plan.SceneFacts.read(scene, sensor))
-            self.edits = _edits_of(scene) if self.plan.modelled("light_sampler") else None
+            self.edits = edits_of(scene) if self.plan.modelled("light_sampler") else None
             self._check(
                 not (on_gpu() and self.plan.modelled("environment_cells")),
                 "environment_cells ends the process on a GPU (Dr.Jit 1.5.0); set environment_cells=0, or type "
@@ -140,7 +140,7 @@ class LightSampler(mi.Emitter):
         return dr.zeros(mi.Wavelength), mi.Spectrum(0)
 
 
-def _edits_of(scene) -> parameters.Edits:
+def edits_of(scene) -> parameters.Edits:
     """Edits of the parameters that the table is made of."""
     pairs = []
     for emitter in scene.emitters():

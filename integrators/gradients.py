@@ -197,7 +197,8 @@ def _places(area: Area, samples: Samples, n_lanes: int) -> tuple:
     of them exist."""
     pixel, sample, active = samples.lanes(area, n_lanes)
     within = mi.Point2f(0.5) if area.box else samples.sampler(pixel, sample, SALT).stratified_2d(0)
-    return area.corner(pixel) + within + mi.Point2f(*(float(v) for v in area.offset)), active
+    place = area.corner(pixel) + within
+    return place + mi.Point2f(*(float(v) for v in area.offset)), active & area.reaches(place)
 
 
 def _image(integrator, sensor, parts: list):

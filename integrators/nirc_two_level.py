@@ -130,6 +130,8 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
             self.choice.look_ahead(self, scene, sensor)
         if not self.choice.may_ask or self.state.image_open or not (train or self.compiling):
             return
+        if self.cache.queried is None:  # no surface is seen that could be learned
+            return
         with dr.suspend_grad():
             self.choice.know_alpha(self, scene, sensor, self.split.alpha < 0)
             if self.mixed is None and (self.choice.rendered + self.choice.under_way >= pilot.WORTH or self.compiling):
@@ -140,7 +142,7 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
         """Choose the division of a camera sample now, where it is not given. Returns :meth:`statistics`."""
         sensor = self._sensor(scene, sensor)
         self.bind(scene, sensor, train=False)
-        if self.needs_cache and self.choice.may_ask:
+        if self.needs_cache and self.choice.may_ask and self.cache.queried is not None:
             with dr.suspend_grad():
                 self.choice.measure(self, scene, sensor)
         return self.statistics()

@@ -176,6 +176,7 @@ class NVCDirectIntegrator(LightSamplingIntegrator):
     """
 
     records = differentiable = False
+    direct_only = True
     CHANNELS = {"visibility": 1, "light": 1, "pmf": 1}  # noqa: RUF012
     render_backward = render_forward = refuse_gradients
 

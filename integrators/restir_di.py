@@ -4,9 +4,9 @@ import math
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mi_neural.caches import presets
+from mi_neural.emitters.common import edits_of
 from mi_neural.integrators import restir_reuse as reuse
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import Nonfinite, refuse_gradients
@@ -18,7 +18,7 @@ from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.film import Area, camera_rays, coverage, recordable
+from mi_neural.render.film import Area, camera_rays, coverage, put_in_reach, recordable
 from mi_neural.render.frozen import LOCK, call, can_freeze, can_freeze_scene, is_recording
 from mi_neural.render.sampling import PathSampler
 
@@ -36,7 +36,7 @@ class _State:
     def __init__(self):
         self.frames: dict = {}  # recorded functions
         self.freeze = True
-        self.chooser = self.power = None
+        self.chooser = self.power = self.edits = None
         self.key: tuple = ()
         self.reset()
 
@@ -123,6 +123,13 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
      * - combination
        - |string|
        - ``unbiased`` or ``biased``, see above. (Default: unbiased)
+     * - max_depth
+       - |int|
+       - Of a scene made for ``path``. Light reflected once is all that is rendered: -1 and numbers above 2 do what 2
+         does, and warn; 0 and 1 are refused. (Default: 2)
+     * - rr_depth
+       - |int|
+       - Of a scene made for ``path``; no path is long enough for it to matter. (Default: 5)
      * - hide_emitters
        - |bool|
        - Leave out what the camera sees of emitters directly. (Default: false)
@@ -167,6 +174,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props.props)
         self.hide, self.max_depth = props.get("hide_emitters", False), 2
+        self._check_depth(props.get("max_depth", 2))
+        props.get("rr_depth", 5)
         self.light_sampler = light_sampler_of(props)
         self.candidates = props.get("candidates", "light" if self.light_sampler is None else "nvc")
         self.preset = props.get("preset", "measured")
@@ -207,6 +216,16 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     def _check(self, ok: bool, message: str) -> None:
         if not ok:
             raise ValueError(f"restir_di: {message}")
+
+    def _check_depth(self, asked: int) -> None:
+        """Refuse a `max_depth` that leaves out direct light; say what another one leaves out here."""
+        self._check(
+            asked == -1 or asked >= 2,
+            f"max_depth is {asked}; it renders direct light: give 2, or take path with that max_depth",
+        )
+        if asked != 2:
+            mi.Log(mi.LogLevel.Warn, f"mi_neural: restir_di renders light reflected once (max_depth 2, not {asked}); "
+                   "neural_path, nirc and plain_path render all")  # fmt: skip
 
     def reset(self) -> None:
         """Forget the frames before, and what a light sampler has learned. Compiled kernels are kept."""
@@ -254,7 +273,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             s.reset()
             s.frames.clear()
             s.power = None  # it has the lights of the scene before
-            s.key, s.freeze = key, can_freeze_scene(scene)
+            s.key, s.freeze, s.edits = key, can_freeze_scene(scene), None
 
         lights, facts = self._lights(scene, recordable(sensor, s.frame))
         camera, pinhole = camera_of(sensor)
@@ -291,10 +310,10 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             )
         lights = s.chooser.lights(scene, sensor)
         if lights is None:  # a single light, which light samplers do not watch
-            table = LightTable(scene)
-            known = s.power.table.columns if s.power is not None else {}
-            same = known and all(np.array_equal(v, known[k]) for k, v in table.columns.items())
-            lights = s.power if same else PowerLights(table)
+            s.edits = s.edits or edits_of(scene)
+            if s.edits.changed():
+                s.power = None
+            lights = s.power or PowerLights(LightTable(scene))
         if s.power is None or s.power.table is not lights.table:
             s.power = lights if isinstance(lights, PowerLights) else PowerLights(lights.table)
         facts = (type(lights).__name__, _facts(lights.table), getattr(lights, "candidates", None))
@@ -347,7 +366,8 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
             if self.state.alpha:
                 values.append(dr.select(ok, coverage(valid), 0))
             values.append(dr.select(ok, mi.Float(1), 0))
-            pos = (area.corner(pixel) + 0.5 if area.box else pos) + mi.Point2f(mi.ScalarPoint2f(area.offset))
+            pos, values = put_in_reach(area, area.corner(pixel) + 0.5 if area.box else pos, values)
+            pos = pos + mi.Point2f(mi.ScalarPoint2f(area.offset))
             past = Past(kept, si, usable)
             dr.eval(pos, values, past, ok)
             return pos, values, past, dr.count(~ok)
@@ -378,7 +398,7 @@ class ReSTIRDirectIntegrator(mi.SamplingIntegrator):
     # -------------------------------------------------------------------------------------------------------------
 
     render_backward = render_forward = refuse_gradients
-    plugin = "restir_di"
+    plugin, direct_only = "restir_di", True
 
     def statistics(self) -> dict:
         """Facts since the last reset: frames, samples that were not finite, and what the light sampler says of itself.

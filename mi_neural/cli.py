@@ -7,6 +7,8 @@ Progress goes to stderr and results to stdout. Exit codes: 0 done, 2 the input c
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 from mi_neural.bench import terminal
@@ -24,8 +26,27 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     help=__doc__.split("\n\n")[0],
 )
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from mi_neural import __version__
+
+        terminal.out.print(__version__, highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None: ...
+
+
 app.command()(render)
 app.command()(compare)
 app.command()(sequence)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from fake_cache import register
 
-from mi_neural.bench import benchmark, budget, denoise, load, page, reference, repeats, report, suite
+from mi_neural.bench import benchmark, budget, denoise, load, page, reference, repeats, report, suite, terminal
 from mi_neural.image import denoise as oidn
 from mi_neural.image import exr, metrics, moments
 
@@ -467,6 +467,19 @@ def test_another_depth_is_noticed():
     assert reference.depth_warning(with_depth("12"), 12) is None
     assert reference.depth_warning(with_depth("-1"), 4294967295) is None
     assert reference.depth_warning(reference.Reference(np.ones((1, 1, 3)), None, {}, None), 12) is None
+    assert "-D max_depth=2" in reference.depth_warning(with_depth("64"), 64, direct_only=True)
+    assert reference.depth_warning(with_depth("2"), 2, direct_only=True) is None
+
+
+@pytest.mark.parametrize("name", ["nvc_direct", "restir_di"])
+def test_reference_that_holds_more_than_direct_light_is_noticed(name):
+    loaded = load.load_scene("cornell_box", (8, 6), {"max_depth": "64"})
+    (case,) = benchmark.make_cases(loaded, [load.parse_integrator(name)])
+    made = reference.Reference(np.ones((6, 8, 3)), None, {"max_depth": "64"}, None)
+    (note,) = terminal.depth_notes(made, loaded, [case])
+    assert note.startswith(f"{name}: it renders light reflected once")
+    (case,) = benchmark.make_cases(loaded, [load.parse_integrator("path")])
+    assert not terminal.depth_notes(made, loaded, [case])
 
 
 # ---------------------------------------------------------------- rows and reports

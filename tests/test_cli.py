@@ -14,7 +14,9 @@ from fake_cache import register
 from test_benchmark import KEYS, WHITE, boxes, has_denoiser
 from typer.testing import CliRunner
 
+import mi_neural
 from mi_neural import scenes
+from mi_neural.bench import load
 from mi_neural.cli import app
 from mi_neural.image import exr
 
@@ -59,6 +61,35 @@ def test_scene_whose_meshes_cannot_be_joined_is_rendered(tmp_path):
     plane, flipped = (f'<shape type="{kind}"> {WHITE} </shape>' for kind in ("rectangle", "cube"))
     flipped = flipped.replace(WHITE, f'<boolean name="flip_normals" value="true"/> {WHITE}')
     run("render", boxes(tmp_path / "b.xml", plane, flipped), *SMALL, "-i", "path", "--spp", 1, "-o", "a.exr")
+
+
+def small_scene(integrator: str, n_balls: int = 1) -> str:
+    sensor = '<sensor type="perspective"> <film type="hdrfilm"/> </sensor>'
+    lamp = '<shape type="rectangle"> <emitter type="area"/> </shape>'
+    balls = '<shape type="sphere"/>' * n_balls
+    Path("a.xml").write_text(f'<scene version="3.0.0"> {integrator} {sensor} {lamp} {balls} </scene>')
+    return "a.xml"
+
+
+def test_depth_of_a_small_scene():
+    """Joining its meshes moved the parsed parts in memory; the process ended where its integrator's keys were read."""
+    for n in range(8):
+        file = small_scene('<integrator type="path"> <integer name="max_depth" value="3"/> </integrator>', n)
+        loaded = load.load_scene(file)
+        assert loaded.carried == {"max_depth": 3} and loaded.integrator == "path"
+
+
+def test_scene_that_names_no_integrator_is_rendered_by_path():
+    run("render", small_scene(""), *SMALL, "--spp", 1, "--json", "a.json")
+    assert facts_of("a.json")["integrator"] == "path"
+
+
+def test_scene_without_surfaces(tmp_path):
+    sensor = '<sensor type="perspective"> <film type="hdrfilm"/> </sensor>'
+    Path("a.xml").write_text(f'<scene version="3.0.0"> {sensor} <emitter type="constant"/> </scene>')
+    for name in ("nirc_two_level", "neural_path"):
+        run("render", "a.xml", *SMALL, "-i", name, "--spp", 1, "--json", "a.json")
+        assert facts_of("a.json")["mean"] == pytest.approx(1)
 
 
 def test_scene_is_a_name_or_a_file_and_sizes_fit():
@@ -196,6 +227,11 @@ def test_another_depth_than_the_references_is_said():
     assert "max_depth is 3, the reference was rendered with 64" in result.output
 
 
+def test_help_and_version_are_where_they_are_expected():
+    assert run("--version").output.strip() == mi_neural.__version__
+    assert "Commands:" in run("-h").output and "--until-error" in run("render", "-h").output
+
+
 def test_info_names_versions_and_llvm():
     text = run("info").output
     for word in ("mitsuba", "drjit", "llvm_ad_rgb", "cores", "cornell_box"):
@@ -225,11 +261,16 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "--seconds", "0"), "--seconds must be greater than 0"),
         ((*RENDER, "--seconds", "nan"), "--seconds must be greater than 0"),
         ((*RENDER, "--pretrain", "-1"), "--pretrain"),
+        ((*RENDER, "-i", "nirc:light_sampler=tree_lights"), "-i nirc:light_sampler.type=tree_lights"),
+        (("render", "cornell_box", "--size", "100000x100000", "-i", "path", "--spp", "1"), "the image: a film of"),
+        (("render", "cornell_box", "--size", "100000x100000", "-i", "nrc", "--spp", "1"), "the image: a film of"),
         (("render", "cornell_box", "--size", "0x8"), "--size takes WIDTHxHEIGHT"),
         (("render", "cornell_box", "--size=-4x8"), "--size takes WIDTHxHEIGHT"),
         ((*RENDER, "--variant", "llvm_rgb"), "unknown variant 'llvm_rgb'; available: .*llvm_ad_rgb"),
         ((*RENDER, "-o", "a.jpg"), "ends in .exr or .png"),
         ((*RENDER, "-o", "file/a.exr"), "cannot write to the folder file"),
+        ((*RENDER, "-o", "a.exr", "--json", "./a.exr"), "-o and --json name the same file"),
+        ((*RENDER, "-o", "other.exr", "--reference", "other.exr"), "-o and --reference name the same file"),
         ((*RENDER, "--json", "file/a.json"), "cannot write to the folder file"),
         ((*RENDER, "--reference", "no.exr"), "no reference no.exr"),
         ((*RENDER, "--reference", "file"), "not a readable EXR"),

@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_neural.render.film import Area, put_in_reach
+
 T = mi.ScalarTransform4f
 SMALL = {"train_frames": 32, "train_samples": 512}
 INTEGRATORS = {
@@ -119,6 +121,17 @@ def test_batch_and_irradiance_meter(name):
     agree(name, images(scene, INTEGRATORS[name]), images(scene, {"type": "path"}, first=100))
 
 
+@pytest.mark.parametrize("keys", [{"type": "plain_path", "max_depth": 2}, {"type": "restir_di"}])
+def test_batch_sensor_that_was_asked_for_rays_before(keys):
+    """It keeps numbers of the last rays, and the process ended where a recording freed them."""
+    view = {k: v for k, v in camera().items() if k != "film"}
+    scene = room(sensor={"type": "batch", "a": view, "b": {**view, "fov": 20}, "film": film(16, 8)})
+    places = mi.Point2f(np.float32([0.2, 0.7]), np.float32([0.3, 0.4]))
+    dr.eval(scene.sensors()[0].sample_ray_differential(0.0, 0.5, places, mi.Point2f(0.5)))
+    path = images(scene, {"type": "path", "max_depth": 2}, spp=256, n=1).mean()
+    assert abs(images(scene, keys, spp=32, n=1).mean() / path - 1) < 0.1
+
+
 def test_one_recording_serves_many_views():
     scene, integrator = room(sensor=None), mi.load_dict(INTEGRATORS["plain_path"])
     for k in range(6):
@@ -137,6 +150,19 @@ def test_crop_window_that_moves_is_no_new_recording():
         part = images(scene, integrator, view, 256, 1)[0]
         assert abs(part.mean() / whole[:, x : x + 4].mean() - 1) < 0.1
     assert len(integrator.film_state.passes.recorded) == 2
+
+
+@pytest.mark.parametrize("keys", [{"type": "plain_path", "max_depth": 2}, {"type": "restir_di"}])
+def test_samples_in_the_border_that_reach_no_pixel(keys):
+    """Mitsuba wrote beside the image for them, and the process ended."""
+    lanczos = {"rfilter": {"type": "lanczos"}, "sample_border": True}
+    view = camera(film=film(8, 4, **lanczos))
+    assert np.isfinite(images(room(sensor=view), keys, spp=16, n=4)).all()
+    area = Area.of(mi.load_dict(view))
+    places = mi.Point2f([-2.9, -2.4, 10.6, 4.0], [1.0, 1.0, 1.0, 6.6])
+    assert (area.border, area.radius) == (3, 3.0) and list(area.reaches(places)) == [False, True, False, False]
+    place, (one,) = put_in_reach(area, places, [mi.Float(1)])
+    assert list(one) == [0, 1, 0, 0] and np.array(place)[:, 0].tolist() == [0.5, 0.5]
 
 
 # ---------------------------------------------------------------- coverage and what is hidden

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from mi_neural.bench import terminal
+from mi_neural.caches import files
 from mi_neural.image import exr
 
 
@@ -83,6 +85,18 @@ def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path):
     for text in ("new", "newer"):
         exr.write_text(tmp_path / "link.txt", text)
         assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "of" / "file.txt").read_text() == text
+@pytest.mark.skipif(not os.path.exists("/dev/null"), reason="no /dev/null")
+def test_devices_and_links_are_written_to_and_not_replaced(tmp_path, rgb):
+    """As root, ``--json /dev/null`` made a file of the device, and every program of the machine failed after that."""
+    device, link, target = (tmp_path / name for name in ("null.exr", "link.txt", "target.txt"))
+    device.symlink_to("/dev/null")
+    link.symlink_to(target)
+    exr.write(device, rgb)
+    exr.write_text(link, "new")
+    files.write(device, "incident", {}, {"a": rgb})
+    assert device.is_symlink() and device.is_char_device() and link.is_symlink() and target.read_text() == "new"
+    terminal.require_writable(device)
+    assert sorted(tmp_path.iterdir()) == [link, device, target]
 
 
 def test_bad_input_is_refused(tmp_path, rgb):

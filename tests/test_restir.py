@@ -329,6 +329,23 @@ def test_bright_and_dim_lights_stay_finite():
         assert np.isfinite(np.array(mi.render(scene, integrator=it, spp=1, seed=k))).all()
 
 
+def test_table_of_a_single_light_is_made_at_first_and_after_an_edit(monkeypatch):
+    """Made for each frame it took three quarters of the time of a small image. Twice, as the first evaluates values."""
+    module, made = importlib.import_module("mi_neural.integrators.restir_di"), []
+    monkeypatch.setattr(module, "LightTable", lambda scene, make=module.LightTable: made.append(1) or make(scene))
+    scene, restir = test_scene(lights("area"), 4), integrator()
+    before = np.array(restir.render(scene, spp=8)).mean()
+    assert 1 <= len(made) <= 2
+    made.clear()
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("radiance.value"))
+    params[key] = 3 * params[key]
+    params.update()
+    restir.reset()
+    after = np.array(restir.render(scene, spp=8)).mean()
+    assert 1 <= len(made) <= 2 and after == pytest.approx(3 * before, rel=1e-4)
+
+
 @pytest.mark.parametrize("key, value, says", [
     ("initial_candidates", 0, "initial_candidates is 0; it must be at least 1"),
     ("history", -1.0, "history is -1.0; give 0"),
@@ -339,10 +356,21 @@ def test_bright_and_dim_lights_stay_finite():
     ("combination", "fair", "combination is 'fair'; give one of: unbiased, biased"),
     ("candidates", "all", "candidates is 'all'; give one of: light, nvc"),
     ("nvc_where", "here", "nvc_where is 'here'; give one of: everywhere, disoccluded"),
+    ("max_depth", 1, "max_depth is 1; it renders direct light: give 2"),
 ])  # fmt: skip
 def test_bad_keys_are_refused(key, value, says):
     with pytest.raises(Exception, match=f"restir_di: {says}"):
         integrator(**{key: value})
+
+
+@pytest.mark.parametrize("depth", [-1, 2, 64])
+def test_integrator_of_a_scene_made_for_path_is_replaced_by_its_name(depth, capfd):
+    """Public scenes set `max_depth`. What another one than 2 leaves out is said."""
+    text = (f'<integrator version="3.0.0" type="restir_di"><integer name="max_depth" value="{depth}"/>'
+            '<integer name="rr_depth" value="8"/></integrator>')  # fmt: skip
+    assert mi.load_string(text).max_depth == 2
+    said = f"restir_di renders light reflected once (max_depth 2, not {depth})"
+    assert (said in "".join(capfd.readouterr())) == (depth != 2)
 
 
 def test_light_sampler_that_would_not_be_asked_is_refused():

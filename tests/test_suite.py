@@ -311,5 +311,6 @@ def test_image_made_elsewhere_of_another_size_is_refused():
     Path("other.exr").write_text("no image")
     quick = ("-i", "path:max_depth=2", "--seconds", "0.01", "--reference-spp", "16", "--image")
     said = compare(*quick, "Other=wide.exr,seconds=1", code=2, of=MOON)
-    assert "wide.exr is 9x5, the film 8x8: add --size 9x5" in said
-    assert "not a readable EXR image" in compare(*quick, "Other=other.exr,seconds=1", code=2, of=MOON)
+    assert "wide.exr is 9x5, the film 8x8: add --size 9x5" in said and "reference" not in said, "before any work"
+    said = compare(*quick, "Other=other.exr,seconds=1", code=2, of=MOON)
+    assert "not a readable EXR image" in said and "reference" not in said

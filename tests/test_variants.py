@@ -105,4 +105,14 @@ for keys in ({}, {"light_sampler": {"type": "tree_lights"}},
     ours = mi.load_dict({"type": "plain_path", "max_depth": 3, **keys})
     for k in (0, 1, 0, 1):
         np.testing.assert_allclose(mean(ours, k, 3), known[k], rtol=0.05)
+
+# Another scene of the process, without such a film: it is rendered, and the film remains whole
+with_bands, scene = scene, mi.load_dict({
+    "type": "scene", "view": {**view, "film": {"type": "hdrfilm", **film}},
+    "ball": {"type": "sphere", "radius": 0.8, "emitter": {"type": "area", "radiance": 2.0}},
+})
+np.testing.assert_allclose(mean(ours, 0, 3), mean(path, 0, 7), rtol=0.05)
+np.testing.assert_allclose(mean(mi.load_dict({"type": "plain_path"}), 0, 3), mean(path, 0, 7), rtol=0.05)
+scene = with_bands
+np.testing.assert_allclose(mean(path, 1, 7), known[1], rtol=1e-4)
 """, quick=True)

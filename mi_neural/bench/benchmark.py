@@ -415,9 +415,10 @@ def make_cases(
 
 
 def own_case(loaded: LoadedScene, keys: dict[str, object]) -> Case:
-    """The scene's own integrator, on which `keys` were set when it was loaded."""
+    """The scene's own integrator, on which `keys` were set when it was loaded; ``path`` where it names none."""
     spec = IntegratorSpec(loaded.integrator, keys)
-    return Case(spec, loaded.scene.integrator(), {**loaded.carried, **keys})
+    integrator = loaded.scene.integrator() or build_integrator(spec)[0]
+    return Case(spec, integrator, {**loaded.carried, **keys})
 
 
 def plain(value: object) -> object:

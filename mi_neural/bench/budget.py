@@ -138,8 +138,11 @@ def warm_up(scene, integrator, spps: list[int], seed: int = 0, sensor: int = 0) 
     """Compile every kernel that rendering with these samples a pixel needs; returns the seconds it took.
 
     An integrator with `prepare` does it without a change of its state; for others one image is rendered and thrown
-    away.
+    away. Raises ``ValueError`` for a film that does not fit memory.
     """
+    from mi_neural.integrators.checks import check_film  # of the variant that is set now
+
+    check_film(scene.sensors()[sensor], "the image")
     start = clock()
     for index, spp in enumerate(spps):
         if hasattr(integrator, "prepare"):

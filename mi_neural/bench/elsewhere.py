@@ -72,6 +72,13 @@ def require_scenes(images: list[Image], names: list[str]) -> None:
             raise InputError(f"--image {image.label}: no scene {image.scene!r} here; there is {there}")
 
 
+def check(images: list[Image], size: tuple[int, int]) -> None:
+    """Raise :class:`InputError` for images that cannot be averaged to a film's size: before a reference is rendered,
+    which takes long."""
+    for image in images:
+        _read(image, size)
+
+
 def pictures(
     images: list[Image], loaded: LoadedScene, reference: Reference, environment: dict[str, object]
 ) -> list[Picture]:

@@ -135,7 +135,9 @@ def load_scene(
             if own is None:
                 raise InputError(f"{path.name} names no integrator to set {key!r} on: choose one with -i")
             own.props[key] = value
-        return state, own
+        # Taken now: nodes that are added to the list later move the others, and `own` would be no node any more
+        carried = {k: own.props[k] for k in CARRIED_KEYS if own is not None and k in own.props}
+        return state, carried, own.props.plugin_name() if own is not None else "path"
 
     def make(state):
         config.merge_meshes, config.merge_equivalent = False, merge
@@ -146,7 +148,7 @@ def load_scene(
         return made[0] if isinstance(made, (list, tuple)) else made
 
     with _resolving(path.parent), _readable(path, parameters):
-        state, own = parse()
+        state, carried, integrator = parse()
         digest = _digest(state)
         try:
             scene = make(state)
@@ -154,14 +156,13 @@ def load_scene(
             if not merge:
                 raise
             merge = False
-            state, own = parse()
+            state, *_ = parse()
             scene = make(state)  # fails in the same way where merging was not the reason
 
     if not isinstance(scene, mi.Scene):
         raise InputError(f"{path} is no scene: its outermost element must be <scene>")
     if not scene.sensors():
         raise InputError(f"{path} has no sensor: add <sensor type='perspective'>")
-    carried = {k: own.props[k] for k in CARRIED_KEYS if own is not None and k in own.props}
     return LoadedScene(
         scene=scene,
         name=path.parent.name if path.stem == "scene" else path.stem,
@@ -169,7 +170,7 @@ def load_scene(
         parameters=parameters,
         digest=digest,
         carried=carried,
-        integrator=own.props.plugin_name() if own is not None else "path",
+        integrator=integrator,
         merged=merge,
     )
 
@@ -375,6 +376,9 @@ def build_integrator(
             continue
         if wrong := [k for k in unknown if k not in dropped]:
             raise InputError(f"{spec.type} has no key {', '.join(map(repr, wrong))}")
+        if "is not a light sampler" in text:
+            raise InputError(f"{spec.label}: name the light sampler by light_sampler.type, as in "
+                             f"-i {spec.type}:light_sampler.type=tree_lights")  # fmt: skip
         text = re.sub(r'^At dictionary node "\w+": failed to instantiate .*? of type "\w+": ', "", text)
         raise InputError(f"cannot make the integrator {spec.label!r}: {text}")
     if not isinstance(integrator, mi.Integrator):

@@ -174,8 +174,11 @@ def cache_folder() -> Path:
     return Path(base or Path.home() / ".cache") / "mi_neural" / "references"
 
 
-def depth_warning(reference: Reference, max_depth: object) -> str | None:
-    """One line where the reference was rendered at another depth, else None. -1 and above 1000 count as no limit."""
+def depth_warning(reference: Reference, max_depth: object, direct_only: bool = False) -> str | None:
+    """One line where the reference was rendered at another depth, else None. -1 and above 1000 count as no limit.
+
+    `direct_only`: whether the integrator shows light that was reflected once, whatever its depth.
+    """
 
     def depth(value: object) -> float:
         number = float(value)
@@ -183,6 +186,11 @@ def depth_warning(reference: Reference, max_depth: object) -> str | None:
 
     theirs = reference.metadata.get("max_depth")
     try:
+        if direct_only and theirs is not None and depth(theirs) > 2:
+            return (
+                f"it renders light reflected once, the reference was rendered with max_depth {theirs} and holds more: "
+                "add -D max_depth=2 if the scene has that parameter, else choose a reference of that depth"
+            )
         if theirs is None or max_depth is None or depth(theirs) == depth(max_depth):
             return None
     except (TypeError, ValueError):

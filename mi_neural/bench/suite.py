@@ -178,6 +178,7 @@ class Suite:
         cases = benchmark.make_cases(loaded, settings.specs, settings.keys, settings.denoise)
         labels = ", ".join(spec.label for spec in settings.specs)
         terminal.announce(f"{name} {loaded.size[0]}x{loaded.size[1]}, {labels}")
+        elsewhere.check(elsewhere.of_scene(settings.images, name), loaded.size)
         reference = self._reference(loaded)
         notes = terminal.depth_notes(reference, loaded, cases)
         notes += terminal.notes(reference, settings.denoise, loaded.size)

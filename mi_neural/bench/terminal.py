@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import tempfile
@@ -94,21 +95,20 @@ def require_writable(file: Path | None) -> None:
         return
     if file.is_dir():
         raise InputError(f"{file} is a folder: give the name of a file in it")
-    if file.is_file() or not file.exists():  # a pipe or a device is written to as it is
+    if not exr.is_special(file):
         require_folder(file.parent)
+    elif not os.access(file, os.W_OK):
+        raise InputError(f"cannot write to {file}")
 
 
-def require_unlike(**files: Path | str | None) -> None:
-    """Raise :class:`InputError` where two options, named as variables are, have the same file."""
-    known: dict[Path, str] = {}
-    for name, file in files.items():
-        path = None if file is None else Path(file).expanduser().resolve()
-        if path is None or (path.exists() and not path.is_file()):
+def require_different(files: dict[str, Path | None]) -> None:
+    """Refuse two options that name one file, which the later would overwrite."""
+    seen: dict[Path, str] = {}
+    for option, file in files.items():
+        if file is None or exr.is_special(file):
             continue
-        option = f"--{name.replace('_', '-')}"
-        if path in known:
-            raise InputError(f"{known[path]} and {option} are both {file}: give two files")
-        known[path] = option
+        if (first := seen.setdefault(file.resolve(), option)) != option:
+            raise InputError(f"{first} and {option} name the same file, {file}: give each its own")
 
 
 def require_folder(folder: Path) -> None:
@@ -146,7 +146,9 @@ def depth_notes(
     for case in cases if reference is not None else []:
         if "max_depth" not in case.keys and "max_depth" in loaded.carried:
             continue  # it has no such key
-        if text := references.depth_warning(reference, case.keys.get("max_depth", -1)):
+        depth = getattr(case.integrator, "max_depth", case.keys.get("max_depth", -1))
+        direct = getattr(case.integrator, "direct_only", False)
+        if text := references.depth_warning(reference, depth, direct):
             notes.append(f"{case.spec.label}: {text}")
             announce(f"warning: {notes[-1]}")
     return notes

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..image import exr
+from mi_neural.image.exr import replacing
 
 #: Changes when a file written before cannot be read any more.
 FILE_VERSION = 4
@@ -36,7 +36,7 @@ def write(path, kind: str, header: dict, arrays: dict[str, np.ndarray]) -> None:
     """
     sizes = {name: list(values.shape) for name, values in arrays.items()}
     text = json.dumps({**header, "kind": kind, "version": FILE_VERSION, "arrays": sizes})
-    with exr.replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, header=np.frombuffer(text.encode(), np.uint8), **arrays)
         file.flush()
         os.fsync(file.fileno())  # the name must not outlive the content

@@ -103,8 +103,9 @@ def render(
     if until_error is not None and getattr(case.integrator, "cumulative", False):
         raise InputError("--until-error compares passes, but images of this integrator hold all passes before them")
     output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
-    for more in ({"load_cache": load_cache}, {"save_cache": save_cache}):  # a cache may be written back
-        terminal.require_unlike(reference=reference, output=output, json=json_, **more)
+    files = {"-o": output, "--json": json_, "--reference": Path(reference) if reference else None}
+    for more in ({"--load-cache": load_cache}, {"--save-cache": save_cache}):  # a cache may be written back
+        terminal.require_different({**files, **more})
     ref = references.of_film(reference, loaded) if reference else None
     terminal.depth_notes(ref, loaded, [case])
     if ref is not None and (note := references.scale_note(ref, loaded.size)):

@@ -175,26 +175,35 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 def replacing(path: str | os.PathLike):
     """Hand out a temporary path beside `path`; on success it takes that name, on an exception it is removed.
 
-    Where `path` is a link, what it leads to is replaced; what is no file (a pipe, ``/dev/null``) is written to.
+    A link stays one, and its target is written. What is no file, as ``/dev/null`` or a pipe, is written to: to give its
+    name to a file would destroy it.
     """
     path = Path(path)
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        with tempfile.TemporaryDirectory(prefix="mi-neural-") as folder:
-            yield (temporary := Path(folder) / path.name)
-            path.write_bytes(temporary.read_bytes())
-        return
-    path = Path(os.path.realpath(path))
+    if special := is_special(path):
+        folder = None
+    else:
+        path = path.resolve()
+        folder = path.parent
     # A suffix of its own keeps what libraries derive from it; hidden, so that nobody takes it for a result
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=folder)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
+        if special:
+            path.write_bytes(temporary.read_bytes())
+            temporary.unlink()
+            return
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def is_special(path: Path) -> bool:
+    """Whether there is something of that name that is neither file nor folder: a device, a pipe."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _umask() -> int:

@@ -26,6 +26,7 @@ class Area:
     size, offset    of the crop window
     border          pixels on each side beyond it
     box             whether the filter is a box: then the samples of a pixel are added up, else each is put on the film
+    radius          of the filter
     """
 
     width: int
@@ -34,6 +35,7 @@ class Area:
     offset: tuple[int, int]
     border: int
     box: bool
+    radius: float = 0.5
 
     @classmethod
     def of(cls, sensor) -> Area:
@@ -41,7 +43,8 @@ class Area:
         border = film.rfilter().border_size() if film.sample_border() else 0
         size, offset = (tuple(int(v) for v in vector) for vector in (film.crop_size(), film.crop_offset()))
         width, height = (v + 2 * border for v in size)
-        return cls(width, height, size, offset, border, film.rfilter().is_box_filter())
+        rfilter = film.rfilter()
+        return cls(width, height, size, offset, border, rfilter.is_box_filter(), float(rfilter.radius()))
 
     @property
     def n_pixels(self) -> int:
@@ -50,6 +53,21 @@ class Area:
     def corner(self, pixel):
         """Corner of a pixel, in pixels of the crop window."""
         return mi.Point2f(mi.Float(pixel % self.width) - self.border, mi.Float(pixel // self.width) - self.border)
+
+    def reaches(self, place):
+        """Whether a sample at `place`, in pixels of the crop window, reaches a pixel. In a border there are some that
+        reach none; for them Mitsuba 3.9.1 writes beside the image, which ends the process (``lanczos``)."""
+        low, high = 0.5 - self.radius, mi.Vector2f(mi.ScalarVector2f(self.size)) - 0.5 + self.radius
+        return dr.all((place > low) & (place < high)) if self.border else mi.Bool(True)
+
+
+def put_in_reach(area: Area, place, values: list) -> tuple:
+    """Samples (place in pixels of the crop window, values) as they may be put on a film: those that reach no pixel are
+    nothing, in the first pixel."""
+    if not area.border:
+        return place, values
+    reaches = area.reaches(place)
+    return dr.select(reaches, place, mi.Point2f(0.5)), [dr.select(reaches, v, 0) for v in values]
 
 
 def camera_rays(sensor, area: Area, pixel, sampler) -> tuple:
@@ -274,6 +292,7 @@ def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixe
             n = samples.n_samples
             values = _sums(values, local // PACKET * PACKET * n + local % PACKET, PACKET, n)
             place = area.corner(local + samples.first_row * area.width) + 0.5
+        place, values = put_in_reach(area, place, values)
         place = place + offset
         dr.eval(place, values, n_bad)
         return place, values, n_bad

@@ -18,6 +18,9 @@ LOCK = threading.RLock()
 #: Shapes that can be part of a recorded function.
 RECORDABLE = {"Mesh", "OBJMesh", "PLYMesh", "SerializedMesh", "BlenderMesh", "Cube", "Rectangle", "Sphere", "Disk",
               "Cylinder", "Instance", "ShapeGroup"}  # fmt: skip
+#: Numbers of sensors that are gone, in a row, after which Dr.Jit's list of sensors is taken to end. It gives them to
+#: new sensors, the lowest first.
+UNUSED_NUMBERS = 64
 #: Whether sensors can be recorded, by their kind.
 _freezes: dict[tuple, bool] = {}
 
@@ -37,11 +40,12 @@ def can_freeze(sensor) -> bool:
     """Whether Dr.Jit can freeze a function of this sensor; tried once for each kind of sensor.
 
     Mitsuba 3.9.1 does not show Dr.Jit all that `thinlens` and `orthographic` sensors hold, and `irradiancemeter` has no
-    ``sample_ray``; rays of theirs are made outside of recorded functions.
+    ``sample_ray``; rays of theirs are made outside of recorded functions. So are those of `batch`, which keeps which of
+    its sensors were last asked: to free that in a recording ends the process.
     """
-    if is_special(sensor):
+    if is_special(sensor) or special_films() or sensor.class_name() == "BatchSensor":
         return False
-    key = mi.variant(), sensor.class_name(), str(sensor) if sensor.class_name() == "BatchSensor" else ""
+    key = mi.variant(), sensor.class_name()
     if key not in _freezes:
         _freezes[key] = _records(_ray_of, sensor)
     return _freezes[key]
@@ -52,6 +56,22 @@ def is_special(sensor) -> bool:
 
     In Mitsuba 3.9.1 a function that is frozen while there is such a film fails, and what the film holds is lost."""
     return isinstance(sensor, mi.Sensor) and mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special)
+
+
+def special_films() -> bool:
+    """Whether any sensor of the process has such a film, in whatever scene: Dr.Jit shows a recording all sensors."""
+    if not mi.is_spectral:  # they work in spectral variants alone
+        return False
+    index, missing = 1, 0
+    while missing < UNUSED_NUMBERS:
+        try:
+            if is_special(dr.reinterpret_array(mi.SensorPtr, mi.UInt32(index))[0]):
+                return True
+            missing = 0
+        except RuntimeError:  # no sensor has this number
+            missing += 1
+        index += 1
+    return False
 
 
 def _ray_of(sensor, sample):
@@ -65,7 +85,7 @@ def can_freeze_scene(scene) -> bool:
 
     Tried where there are shapes that are not known to be fine.
     """
-    if any(is_special(s) for s in scene.sensors()):
+    if special_films():
         return False
     return {s.class_name() for s in scene.shapes()} <= RECORDABLE or _records(_hit_in, scene)
 
@@ -92,6 +112,8 @@ def _lit_in(scene, sample):
 
 
 def _records(function, thing) -> bool:
+    if special_films():
+        return False
     try:
         with dr.suspend_grad(), undisturbed():
             dr.freeze(function)(thing, mi.Point2f(dr.opaque(mi.Float, 0.5, 2), dr.opaque(mi.Float, 0.25, 2)))
@@ -109,7 +131,7 @@ def disturbed(error: RuntimeError) -> bool:
 def call(recorded: dict, key, plain: Callable, *args):
     """Call ``recorded[key]``, the frozen form of `plain`; `plain` where there is none or it cannot be recorded now."""
     with undisturbed():
-        if key not in recorded:
+        if key not in recorded or special_films():
             return plain(*args)
         try:
             return recorded[key](*args)
