@@ -73,27 +73,38 @@ IN_VARIANTS = [("colours", "nvc"), ("coloured smoke", None), ("camera in colours
 LIMITS = [{"max_depth": 1}, {"max_depth": 2}, {"max_depth": 3, "rr_depth": 1}, {"max_depth": -1, "rr_depth": 2},
           {"max_depth": 4, "hide_emitters": True}]  # fmt: skip
 #: Comparisons of this file with a reference; together they fail by chance one choice of seeds in ten thousand.
-N_TESTS = len(SCENES) + len(CHOSEN) + len(VARIANTS) * len(IN_VARIANTS) + 2 * len(LIMITS) + 8
+N_TESTS = len(SCENES) + len(CHOSEN) + len(VARIANTS) * len(IN_VARIANTS) + len(LIMITS) + 8
 DEPTH = {"max_depth": 8}
 
 
-def compare(name: str, scene, reference: str, keys: dict, spp: int = 256, **depth) -> None:
+def compare(name: str, scene, reference: str, keys: dict, spp: int = 256, known=None, **depth) -> np.ndarray:
+    """With images of the `reference`, or with those `known`, which are returned."""
     depth = depth or DEPTH
-    known = renders(scene, {"type": reference, **depth}, 16, spp, first_seed=500)
+    if known is None:
+        known = renders(scene, {"type": reference, **depth}, 16, spp, first_seed=500)
     ours = renders(scene, {"type": "plain_path", **depth, **keys}, 16, spp)
     assert_same_mean(ours, known, name, blocks=2, relative=1e-4, tests=N_TESTS)
+    return known
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_image_is_that_of_volpath(name):
+@pytest.fixture(scope="module")
+def seen():
+    """Scenes and their references of the tests so far, by name."""
+    return {}
+
+
+# One scene after another, each by all samplers: its reference is rendered once
+@pytest.mark.parametrize("name, sampler", [
+    (name, sampler) for name in SCENES for sampler in (None, *(s for n, s in CHOSEN if n == name))
+])  # fmt: skip
+def test_image_is_that_of_volpath(seen, name, sampler):
     make, reference = SCENES[name]
-    compare(name, make(), reference, {})
-
-
-@pytest.mark.parametrize("name, sampler", CHOSEN)
-def test_image_by_a_light_sampler_is_that_of_volpath(name, sampler):
-    make, reference = SCENES[name]
-    compare(f"{name}, {sampler}", make(), reference, {"light_sampler": SAMPLERS[sampler]})
+    if name not in seen:
+        seen.clear()
+        seen[name] = make(), None
+    scene, known = seen[name]
+    keys = {"light_sampler": SAMPLERS[sampler]} if sampler else {}
+    seen[name] = scene, compare(f"{name}, {sampler}", scene, reference, keys, known=known)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -105,12 +116,17 @@ def test_image_in_mono_and_spectral_variants(variant, name, sampler):
     compare(f"{variant}, {name}, {sampler}", make(), reference, keys)
 
 
-@pytest.mark.parametrize("shell", ["null", "mask"])
+@pytest.fixture(scope="module")
+def both_shells():
+    """Fog in a shell of nothing on the left, in one of a mask on the right: in blocks of the image of their own."""
+    return room(
+        box=cube(fog(1.5, 0.9), size=0.4, at=(-0.45, 0, 0)), shell=cube(fog(1.5, 0.9), HALF_OPEN, 0.4, (0.45, 0, 0)),
+        seen=lamp((0, 0.2, -0.8), rgb(1.0, 2.0, 3.0), 0.2), sky={"type": "constant", "radiance": 0.2})  # fmt: skip
+
+
 @pytest.mark.parametrize("limits", LIMITS)
-def test_depths_roulette_and_hidden_emitters_are_those_of_volpath(limits, shell):
-    box = cube(fog(1.5, 0.9), HALF_OPEN if shell == "mask" else None)
-    scene = room(box=box, seen=lamp((0, 0.2, -0.8), rgb(1.0, 2.0, 3.0), 0.2), sky={"type": "constant", "radiance": 0.2})
-    compare(f"{limits}, {shell}", scene, "volpath", {}, **limits)
+def test_depths_roulette_and_hidden_emitters_are_those_of_volpath(both_shells, limits):
+    compare(str(limits), both_shells, "volpath", {}, **limits)
 
 
 @pytest.mark.parametrize("hide", [False, True])
