@@ -171,8 +171,8 @@ def test_threshold_of_denoised_images_grows_with_samples_and_with_what_is_wrong(
 
 def test_threshold_of_denoised_images_is_higher_after_few_steps():
     assert young_threshold(0.05, YOUNG, 20) == pytest.approx(1)
-    assert young_threshold(0.05, YOUNG / 4, 20) == pytest.approx(16**2)
-    assert young_threshold(0.1, YOUNG, 20) == young_threshold(0.05, YOUNG, 40) == pytest.approx(4)
+    assert young_threshold(0.05, YOUNG / 2, 20) == pytest.approx(2**6)
+    assert young_threshold(0.2, YOUNG, 20) == young_threshold(0.05, YOUNG, 80) == pytest.approx(8)
 
 
 def test_grid_is_kept_restored_and_forgotten(rng):
