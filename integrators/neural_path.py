@@ -29,6 +29,8 @@ DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
 DENOISED_UNBOUNDED = 0.5
 #: Ratio b²/v from which on the spread threshold of an image that will be denoised is the largest.
 LARGE_RATIO = 0.02
+#: Constant of :func:`young_threshold`, in training steps.
+YOUNG = 120.0
 #: A cache that is trained by time stays out of images until it has so many steps. Denoised images of 16 samples have
 #: over the squared error of `path` after 5, 10, 20, 40, 80 steps: veach-ajar 4.4 to 8.2, 2.5 to 8.4, 1.5 to 1.8, 0.7 to
 #: 2.0, 0.5 to 0.6; living room 1.1 to 1.2, 0.9, 0.8 to 0.9, 0.8, 0.8; Cornell box 1.1, 0.6, 0.6, 0.6, 0.5 (manual,
@@ -45,6 +47,17 @@ def denoised_threshold(ratio, spp):
     five thresholds (1 to 100) in six scenes, with 4, 16 and 64 samples (studies/spread_threshold.py).
     """
     return dr.sqrt(spp) * dr.minimum(1, dr.square(ratio / LARGE_RATIO))
+
+
+def young_threshold(mean_bias, steps, spp):
+    """Spread threshold of an image of `spp` samples that will be denoised, by a cache of so many training `steps`:
+    ``(spp b² (120 / steps)^4)^1.5``.
+
+    `mean_bias` is b², the cache's squared bias. Form and number fit six scenes after 8 to 300 steps, with 4 to 64
+    samples and thresholds of 0.1 to 4096 (manual, measured).
+    """
+    expected = spp * mean_bias * dr.square(dr.square(YOUNG / steps))
+    return expected * dr.sqrt(expected)
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
@@ -106,10 +119,11 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         return super().statistics() | ({"cache_left_out": True} if self.left_out else {})
 
     def settings(self, spp: int) -> tuple:
-        """Samples that the noise is averaged over, and the spread threshold."""
+        """Samples that the noise is averaged over, the spread threshold, and training steps of the cache."""
         if self.left_out:
-            return math.inf, math.inf
-        return float(spp) * (DENOISED_SAMPLES if self.denoised else 1), grown(self.spread_threshold, spp)
+            return math.inf, math.inf, 1
+        samples = float(spp) * (DENOISED_SAMPLES if self.denoised else 1)
+        return samples, grown(self.spread_threshold, spp), max(1, self.cache.steps)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -119,10 +133,13 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         `field`: a :class:`~mi_neural.caches.accuracy.MeasuredField`; None: path tracing. The share w depends on nothing
         but the place and the number of samples of the finished image.
         """
-        n_samples, threshold = settings
+        n_samples, threshold, steps = settings
         cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
         if cached and self.denoised:
-            threshold = dr.maximum(threshold, denoised_threshold(field.grid.ratio, n_samples / DENOISED_SAMPLES))
+            spp = n_samples / DENOISED_SAMPLES
+            threshold = dr.maximum(threshold, denoised_threshold(field.grid.ratio, spp))
+            young = young_threshold(field.grid.mean_bias, steps, spp)
+            threshold, n_samples = dr.maximum(threshold, young), n_samples * (1 + young)
 
         def stop(path, spread, smooth, first, sampler):
             share = field.grid.share(*self.walk.place(path), n_samples, smooth)
@@ -195,8 +212,8 @@ NeuralPathIntegrator.__doc__ = (
      * - denoised
        - |bool|
        - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and is
-         raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` where that is more, b²/v being the mean of the scene.
-         (Default: false)
+         raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` and, after few training steps t, to
+         :math:`(N b^2 (120/t)^4)^{3/2}` where that is more, b² and v being means of the scene. (Default: false)
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where

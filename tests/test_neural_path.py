@@ -21,7 +21,7 @@ from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
 from mi_neural.estimators.spread import grown
-from mi_neural.integrators.neural_path import DENOISED_SAMPLES, LEAST_STEPS, denoised_threshold
+from mi_neural.integrators.neural_path import DENOISED_SAMPLES, LEAST_STEPS, YOUNG, denoised_threshold, young_threshold
 from mi_neural.render.kernels import on_gpu
 
 SLOW = pytest.mark.slow
@@ -59,10 +59,10 @@ def trained(box):
     return integrator
 
 
-def force(integrator, noise=1.0, bias=1e9, ratio=0.0) -> None:
+def force(integrator, noise=1.0, bias=1e9, ratio=0.0, mean_bias=0.0) -> None:
     """Let the grid of a trained integrator say the same everywhere."""
     grid = integrator.cache.queried.grid
-    grid.ratio = mi.Float(ratio)
+    grid.ratio, grid.mean_bias = mi.Float(ratio), mi.Float(mean_bias)
     grid.noise, grid.bias = (dr.full(mi.Float, v, grid.constants.n_entries) for v in (noise, bias))
     dr.make_opaque(grid)
 
@@ -156,16 +156,23 @@ def test_values_that_are_not_finite_or_huge_spoil_nothing(rng):
 def test_ratio_is_squared_bias_over_noise(rng):
     """Of 2^18 pairs: 0.04 over 0.25, within four standard errors of about 1 %."""
     grid = Accuracy(*BOX)
-    assert float(grid.ratio[0]) == 0
+    assert float(grid.ratio[0]) == float(grid.mean_bias[0]) == 0
     observe(grid, pairs(rng, 2**18, 0.25, 0.625))  # over a prediction that is 1.25 of the truth
     assert float(grid.ratio[0]) == pytest.approx(0.04 / 0.25, rel=0.04)
+    assert float(grid.mean_bias[0]) == pytest.approx(grid.summary()["bias_of_pairs"], rel=1e-4)
     grid.reset()
-    assert float(grid.ratio[0]) == 0
+    assert float(grid.ratio[0]) == float(grid.mean_bias[0]) == 0
 
 
 def test_threshold_of_denoised_images_grows_with_samples_and_with_what_is_wrong():
     assert denoised_threshold(0.0, 64) == 0 and denoised_threshold(0.02, 64) == denoised_threshold(5.0, 64) == 8
     assert denoised_threshold(0.01, 64) == pytest.approx(2) and denoised_threshold(0.01, 16) == pytest.approx(1)
+
+
+def test_threshold_of_denoised_images_is_higher_after_few_steps():
+    assert young_threshold(0.05, YOUNG, 20) == pytest.approx(1)
+    assert young_threshold(0.05, YOUNG / 2, 20) == pytest.approx(2**6)
+    assert young_threshold(0.2, YOUNG, 20) == young_threshold(0.05, YOUNG, 80) == pytest.approx(8)
 
 
 def test_grid_is_kept_restored_and_forgotten(rng):
@@ -328,11 +335,23 @@ def test_denoised_counts_noise_less(trained, box, tmp_path):
     for denoised in (False, True):
         integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels="share, depth")
         found[denoised] = render(box, integrator, 4)[..., 3:].mean(axis=(0, 1))
-    n, c = auto(denoised=True).settings(4)
-    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and auto(denoised=True).settings(512)[1] == 2.0
+    n, c, steps = auto(denoised=True).settings(4)
+    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and steps == 1 and auto(denoised=True).settings(512)[1] == 2.0
     assert auto(denoised=True, spread_threshold=0.1).settings(4)[1] == 0.1
     print(f"(share, depth): {found[False]}, denoised {found[True]}")
     assert found[True][0] < 0.5 * found[False][0] and found[True][1] > found[False][1]
+
+
+def test_young_cache_is_traced_past_in_denoised_images(box):
+    """After eight steps paths run on nearly as far as without a cache, after 200 they end in it."""
+    integrator, depths = auto(denoised=True, channels="depth"), {}
+    for steps in (8, 200):
+        integrator.train(box, steps - integrator.cache.steps)
+        assert integrator.settings(64)[2] == steps
+        depths[steps] = render(box, integrator, 64)[..., 3].mean()
+    far = render(box, auto(spread_threshold=math.inf, channels="depth", freeze_cache=True), 64)[..., 3].mean()
+    print(f"depth {depths}, traced {far}")
+    assert depths[8] > 0.9 * far and depths[200] < 0.7 * far
 
 
 # ---------------------------------------------------------------- state
@@ -413,6 +432,7 @@ def test_a_cache_with_no_time_to_learn_stays_out_of_the_image(box, monkeypatch):
     assert "cache_left_out" not in integrator.statistics()
     assert render(box, integrator)[..., 3:6].max() > 0
     integrator.reset()
+    integrator.denoised = False
     integrator.train(box, 3)  # who asks for three steps gets an image of three
     assert render(box, integrator)[..., 3:6].max() > 0
 
