@@ -174,7 +174,7 @@ def test_share_of_paths_without_an_end_in_media():
 
     def share(scene, **keys):
         integrator = mi.load_dict(keys)
-        integrator.bind_media(scene, scene.sensors()[0], False)
+        integrator.bind(scene, scene.sensors()[0], train=False)
         return integrator.cache.training.unbounded_share
 
     denoised = {"type": "neural_path", "denoised": True}

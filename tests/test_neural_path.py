@@ -430,9 +430,9 @@ def test_a_cache_with_no_time_to_learn_stays_out_of_the_image(box, monkeypatch):
     assert np.abs(image[..., 3:]).max() == 0 and image[..., :3].mean() > 0
     integrator.train(box, LEAST_STEPS - integrator.cache.steps)
     assert "cache_left_out" not in integrator.statistics()
+    integrator.denoised = False
     assert render(box, integrator)[..., 3:6].max() > 0
     integrator.reset()
-    integrator.denoised = False
     integrator.train(box, 3)  # who asks for three steps gets an image of three
     assert render(box, integrator)[..., 3:6].max() > 0
 
