@@ -276,7 +276,7 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "--reference", "file"), "not a readable EXR"),
         ((*RENDER, "-i", "path", "-o", "a.exr", "--json", "./a.exr"), "-o and --json name the same file, a.exr"),
         ((*RENDER, "--reference", "fits.exr", "-o", "fits.exr"), "-o and --reference name the same file, fits.exr"),
-        ((*RENDER, "-i", "fake_cache", "--load-cache", "file", "--json", "file"), "--json and --load-cache name the same"),
+        ((*RENDER, "-i", "fake_cache", "--load-cache", "file", "--json", "file"), "--json and --load-cache name"),
         ((*RENDER, "-i", "fake_cache", "--save-cache", "c", "-o", "a.png", "--json", "c"), "--json and --save-cache"),
         ((*RENDER, "--reference", "other.exr"), "other.exr is 5x4, the image 16x12"),
         ((*RENDER, "--reference", "nan.exr"), "non-finite pixels"),
