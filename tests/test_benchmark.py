@@ -431,6 +431,22 @@ def test_errors_against_a_smaller_reference_are_those_of_block_means():
         benchmark.judge(row, [image[:, :11]], known)
 
 
+def test_noise_of_the_reference_is_no_part_of_flip_against_the_denoised_one():
+    if not has_denoiser():
+        pytest.skip("Open Image Denoise is not installed")
+    image = np.full((24, 32, 3), 0.5, np.float32)
+    noise = np.random.default_rng(4).normal(0.0, 0.1, image.shape).astype(np.float32)
+    guides = denoise.Guides(image, np.zeros_like(image), clean=True)
+    known = reference.Reference(image + noise, None, {}, None)
+    row = SimpleNamespace()
+    benchmark.judge(row, [image], known)
+    assert row.flip > 0.1 and not hasattr(row, "flip_clean")
+    benchmark.judge(row, [image], denoise.cleaned(known, guides))
+    assert row.flip > 0.1 and row.flip_clean < 0.5 * row.flip
+    smaller = reference.Reference(known.rgb[::2, ::2], None, {}, None)
+    assert denoise.cleaned(smaller, guides).clean is None
+
+
 def test_references_have_a_place_in_the_users_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert reference.cache_folder() == tmp_path / "mi_neural" / "references"

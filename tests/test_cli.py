@@ -209,6 +209,8 @@ def test_compare_writes_report_table_and_images():
         assert image.metadata["label"] == row["label"]
         assert os.path.exists(os.path.join("out", row["image"].replace(".exr", ".png")))
     assert len({row["image"] for row in rows}) == len(rows)
+    assert all((row["flip_clean"] is not None) == has_denoiser() for row in rows)
+    assert ("FLIP clean" in result.output) == has_denoiser()
     assert "</html>" in Path("out/report.html").read_text() and "fake_cache" in Path("out/table.md").read_text()
 
 

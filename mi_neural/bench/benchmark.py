@@ -52,6 +52,7 @@ class Row:
     `None` means not measured or not applicable: errors without a reference, `flicker` of a single image, cache counts
     of an integrator without a cache, `split` (a :class:`.split.Split`) of rows of another kind, `spp` of an image made
     elsewhere (:mod:`.elsewhere`). `seconds_to_first_image` counts from the start of the process, compiling included.
+    `flip` is measured against the reference, `flip_clean` against the denoised reference.
     """
 
     scene: str
@@ -81,6 +82,7 @@ class Row:
     relmse: float | None = None
     relmse_trimmed: float | None = None
     flip: float | None = None
+    flip_clean: float | None = None
     flicker: float | None = None
     repeat: int = 0
     peak_mib: float | None = None
@@ -377,6 +379,8 @@ def judge(
     row.relmse, row.relmse_trimmed = _relmse(images, reference)
     found = [metrics.flip(image, reference.rgb, exposures) for image in images]
     row.flip = float(np.mean([f.mean for f in found]))
+    if reference.clean is not None:
+        row.flip_clean = float(np.mean([metrics.flip(image, reference.clean, exposures).mean for image in images]))
     return found[0].map
 
 

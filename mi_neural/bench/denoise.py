@@ -6,6 +6,8 @@ denoiser than another. Their time is reported separately and counts for no integ
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mi_neural.image import denoise as oidn
@@ -13,6 +15,7 @@ from mi_neural.image import denoise as oidn
 from .budget import STREAM_GUIDES, clock, pass_seed
 from .guides import Guides, guides
 from .load import InputError
+from .reference import Reference
 
 
 def require() -> None:
@@ -40,6 +43,14 @@ def denoise(rgb: np.ndarray, guides: Guides) -> tuple[np.ndarray, float]:
     start = clock()
     clean = oidn.denoise(rgb, guides.albedo, guides.normal, guides.clean)
     return clean, clock() - start
+
+
+def cleaned(reference: Reference, guides: Guides) -> Reference:
+    """The reference together with its denoised image (`clean`). One of another size than the film stays as it is: the
+    guides do not fit it."""
+    if reference.rgb.shape != guides.albedo.shape:
+        return reference
+    return replace(reference, clean=denoise(reference.rgb, guides)[0])
 
 
 def warm_up(guides: Guides) -> float:

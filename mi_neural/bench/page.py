@@ -24,6 +24,7 @@ from .report import (
     SceneResult,
     best,
     best_of_summary,
+    errors_of,
     html_table,
     name_of,
     number,
@@ -191,8 +192,8 @@ def _wide(cells: list[list[str]], marked: set[tuple[int, int]] = frozenset()) ->
 def _summary(report: Report) -> str:
     parts = [
         '<section id="summary"><h2>All scenes</h2>',
-        "<p>Trimmed relMSE / FLIP. The factor is the trimmed relMSE of the first integrator, denoised or not as in "
-        "this line, over that of this line (geometric mean over the scenes). The least error of a column is "
+        f"<p>Errors: {errors_of(report)}. The factor is the trimmed relMSE of the first integrator, denoised or not as "
+        "in this line, over that of this line (geometric mean over the scenes). The least error of a column is "
         'marked.</p><div class="tables">',
     ]
     for title, cells in summary(report):

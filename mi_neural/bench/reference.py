@@ -41,6 +41,7 @@ class Reference:
     metadata  attributes of the file: integrator, max_depth, spp
     path      the file
     seconds   time spent rendering it now; 0 where it was read
+    clean     `rgb` after the denoiser, same shape; None: not made. FLIP has no way to subtract the noise of `rgb`
     """
 
     rgb: np.ndarray
@@ -48,6 +49,7 @@ class Reference:
     metadata: dict[str, object]
     path: Path
     seconds: float = 0.0
+    clean: np.ndarray | None = None
 
     def noise_floor(self) -> float | None:
         """What the noise of this reference adds to relMSE: mean of variance / (lum^2 + 1e-2), scaled. None: unknown."""

@@ -75,7 +75,7 @@ class Group:
         label, mode, budget, denoised = self.key
         entry = {"scene": self.first.scene, "label": label, "mode": mode, "budget_seconds": budget,
                  "denoised": denoised, "repeats": len(self.rows), "level": LEVEL}  # fmt: skip
-        for name in ("relmse_trimmed", "relmse", "flip", "flicker", "spp", "seconds_total", "peak_mib"):
+        for name in ("relmse_trimmed", "relmse", "flip", "flip_clean", "flicker", "spp", "seconds_total", "peak_mib"):
             entry |= {name: self.mean(name), f"{name}_half_width": self.half_width(name)}
         return entry | {"squared_bias": self.squared_bias, "squared_bias_error": self.squared_bias_error,
                         "variance": self.variance}  # fmt: skip

@@ -31,6 +31,7 @@ COLUMNS = (
     ("variance", lambda g: number(g.variance)),
     ("relMSE", lambda g: interval(g, "relmse")),
     ("FLIP", lambda g: interval(g, "flip")),
+    ("FLIP clean", lambda g: interval(g, "flip_clean")),
     ("flicker", lambda g: interval(g, "flicker")),
     ("peak MiB", lambda g: number(_rounded(g.mean("peak_mib")))),
 )
@@ -39,8 +40,8 @@ BEST = {
     "spp": (lambda g: g.mean("spp"), max), "ns/sample": (lambda g: g.mean("ns_per_sample"), min),
     "relMSE trimmed": (lambda g: g.mean("relmse_trimmed"), min), "bias²": (lambda g: g.squared_bias, min),
     "variance": (lambda g: g.variance, min), "relMSE": (lambda g: g.mean("relmse"), min),
-    "FLIP": (lambda g: g.mean("flip"), min), "flicker": (lambda g: g.mean("flicker"), min),
-    "peak MiB": (lambda g: g.mean("peak_mib"), min),
+    "FLIP": (lambda g: g.mean("flip"), min), "FLIP clean": (lambda g: g.mean("flip_clean"), min),
+    "flicker": (lambda g: g.mean("flicker"), min), "peak MiB": (lambda g: g.mean("peak_mib"), min),
 }  # fmt: skip
 #: Parts of a frame, as :class:`.split.Split` names them.
 PARTS = ("train", "query", "trace", "film", "python")
@@ -127,10 +128,17 @@ def split_table(groups: Iterable[Group]) -> list[list[str]]:
     return [["integrator", "compile s", "frame ms", *PARTS], *lines] if lines else []
 
 
+def errors_of(report: Report) -> str:
+    """The errors in a cell of :func:`summary`."""
+    clean = any(row.flip_clean is not None for row in report.rows)
+    return "trimmed relMSE / FLIP" + (" / FLIP clean" if clean else "")
+
+
 def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
-    """One table for each mode and budget: integrators over scenes, trimmed relMSE / FLIP, and by which factor trimmed
-    relMSE is below that of the first integrator with as much denoising: a geometric mean over the scenes where
-    neither is below what the reference resolves, left out where a scene is missing."""
+    """One table for each mode and budget: integrators over scenes, trimmed relMSE / FLIP / FLIP clean (which is there
+    with a denoiser), and by which factor trimmed relMSE is below that of the first integrator with as much denoising: a
+    geometric mean over the scenes where neither is below what the reference resolves, left out where a scene is
+    missing."""
     tables = []
     groups = [g for scene in report.scenes for g in scene.groups if g.mean("relmse_trimmed") is not None]
     for mode, budget in dict.fromkeys((g.first.mode, g.first.budget_seconds) for g in groups):
@@ -144,7 +152,9 @@ def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
             for scene in report.scenes:
                 found = {g.key: g for g in scene.groups}
                 g = found.get((label, mode, budget, denoised))
-                texts.append("" if g is None else f"{number(g.mean('relmse_trimmed'))} / {number(g.mean('flip'))}")
+                clean = None if g is None else g.mean("flip_clean")
+                values = [] if g is None else [g.mean("relmse_trimmed"), g.mean("flip"), *([clean] if clean else [])]
+                texts.append(" / ".join(map(number, values)))
                 first = found.get((kinds[0][0], mode, budget, denoised))
                 if g is not None and first is not None:
                     errors[scene.name] = first.mean("relmse_trimmed"), g.mean("relmse_trimmed")

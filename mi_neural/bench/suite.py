@@ -229,6 +229,9 @@ class Suite:
         if settings.denoise:
             guides, seconds = denoise.render_guides(loaded.scene, plan.seed)
             found.notes.append(f"The guides took {seconds:.2g} s, which no row contains.")
+            reference = denoise.cleaned(reference, guides)
+            if reference.clean is not None:
+                found.notes.append("FLIP clean is measured against the denoised reference.")
         shared = reference, guides
         shown = elsewhere.of_scene(settings.images, found.name)
         for picture in elsewhere.pictures(shown, loaded, reference, environment.describe()):

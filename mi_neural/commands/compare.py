@@ -143,7 +143,7 @@ def compare(
     if len(found.scenes) == 1:
         terminal.print_rows(found.scenes[0].groups)
     for title, cells in report.summary(found) if len(found.scenes) > 1 else []:
-        terminal.out.print(f"\n{title}: trimmed relMSE / FLIP", markup=False)
+        terminal.out.print(f"\n{title}: {report.errors_of(found)}", markup=False)
         terminal.print_table(cells)
     for note in found.notes + (found.scenes[0].notes if len(found.scenes) == 1 else []):
         terminal.out.print(note, soft_wrap=True, markup=False)
