@@ -226,6 +226,9 @@ def keys_read(cls: type) -> set[str]:
             if isinstance(node, ast.Call) and ast.unparse(node) == "light_sampler_of(props)":
                 keys.add("light_sampler")
                 continue
+            if isinstance(node, ast.Call) and ast.unparse(node).startswith("blending_of(props, "):
+                keys |= set(BLEND_NAMES)
+                continue
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.args:
                 asks = node.func.attr in ("get", "has_property", "string", "get_string", "get_texture")
                 owner, key = node.func.value, node.args[0]
