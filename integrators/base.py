@@ -14,12 +14,11 @@ from mi_neural.integrators.checks import (
     check_phase_functions,
     check_spp,
     refuse_medium_of,
-    sensor_of,
 )
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.binding import BoundScene
-from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
+from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage, sensor_of
 from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.media import Media
 from mi_neural.render.sampling import PathSampler

@@ -148,19 +148,3 @@ def _free_memory() -> int | None:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
         return None
-
-
-def sensor_of(scene, sensor, plugin: str):
-    """The sensor of that number, or the sensor given. Raises ValueError where there is none."""
-    if isinstance(sensor, mi.Sensor):
-        return sensor
-    if not hasattr(sensor, "__index__"):
-        raise ValueError(f"{plugin}: sensor is {sensor!r}; give its number in the scene, or a sensor")
-    if not scene.sensors():
-        raise ValueError(
-            f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>, or give one to "
-            "mi.render(scene, sensor=...)"
-        )
-    if not 0 <= sensor < len(scene.sensors()):
-        raise ValueError(f"{plugin}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
-    return scene.sensors()[sensor]

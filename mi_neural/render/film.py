@@ -82,6 +82,22 @@ def camera_rays(sensor, area: Area, pixel, sampler) -> tuple:
     return ray, weight, place, sampler
 
 
+def sensor_of(scene, sensor, who: str):
+    """The sensor of that number, or the sensor given. Raises ValueError, beginning with `who`, where there is none."""
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    if not hasattr(sensor, "__index__"):
+        raise ValueError(f"{who}: sensor is {sensor!r}; give its number in the scene, or a sensor")
+    if not scene.sensors():
+        raise ValueError(
+            f"{who}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>, or give one to "
+            "mi.render(scene, sensor=...)"
+        )
+    if not 0 <= sensor < len(scene.sensors()):
+        raise ValueError(f"{who}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
+    return scene.sensors()[sensor]
+
+
 def film_rays(sensor, place, sampler) -> mi.Ray3f:
     """Rays through `place`, in [0, 1]² of the film; time and aperture are drawn from `sampler`."""
     time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
