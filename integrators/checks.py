@@ -94,7 +94,13 @@ def no_gradients_in_media(plugin: str) -> RuntimeError:
 
 
 def _check_emitter(emitter, plugin: str) -> None:
-    """Refuse a light that is not finite: no choice of lights has a probability then, and every pixel is lost."""
+    """Refuse a light that is not finite: no choice of lights has a probability then, and every pixel is lost. And one
+    that Mitsuba 3.9.1 cannot evaluate inside of recorded loops (`path` fails, too); to try it may end the process."""
+    if emitter.class_name() == "TimedSunskyEmitter":
+        raise ValueError(
+            f"{plugin}: emitter '{emitter.id()}' is a timed_sunsky, which fails in symbolic loops of Mitsuba 3.9.1, also in "
+            'path; use <emitter type="sunsky"/> at one time (keys year, month, day, hour, ...)'
+        )
     shape = emitter.get_shape()
     parts = [(f"emitter '{emitter.id()}'", mi.traverse(emitter), "")]
     if shape is not None and shape.is_mesh():
