@@ -98,8 +98,8 @@ def _check_emitter(emitter, plugin: str) -> None:
     that Mitsuba 3.9.1 cannot evaluate inside of recorded loops (`path` fails, too); to try it may end the process."""
     if emitter.class_name() == "TimedSunskyEmitter":
         raise ValueError(
-            f"{plugin}: emitter '{emitter.id()}' is a timed_sunsky, which fails in symbolic loops of Mitsuba 3.9.1, also in "
-            'path; use <emitter type="sunsky"/> at one time (keys year, month, day, hour, ...)'
+            f"{plugin}: emitter '{emitter.id()}' is a timed_sunsky, which Mitsuba 3.9.1 cannot evaluate in symbolic "
+            'loops, also those of path; use <emitter type="sunsky"/> at one time (keys year, month, day, hour, ...)'
         )
     shape = emitter.get_shape()
     parts = [(f"emitter '{emitter.id()}'", mi.traverse(emitter), "")]

@@ -258,10 +258,10 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "-i", "path", "--set", "max_depth"), "--set takes key=value"),
         ((*RENDER, "-D", "zork=1"), "has no parameter zork"),
         ((*RENDER, "--spp", "4", "--seconds", "1"), "--spp and --seconds exclude each other"),
-        ((*RENDER, "-i", "path", "-i", "nirc"), "^mi-neural: -i/--integrator is given 2 times, .*compare SCENE -i A -i B"),
-        ((*RENDER, "-o", "a.exr", "--output", "b.exr"), "--output/-o is given 2 times, and render takes it once: leave"),
+        ((*RENDER, "-i", "path", "-i", "nirc"), "-i/--integrator is given 2 times, .*compare SCENE -i A -i B"),
+        ((*RENDER, "-o", "a.exr", "--output", "b.exr"), "--output/-o is given 2 times, and render takes it once"),
         ((*RENDER, "--spp", "4", "--spp", "4", "--spp=8"), "--spp is given 3 times, and render takes it once: leave"),
-        (("plan", "cornell_box", "-i", "nirc", "-i", "nrc"), "-i/--integrator is given 2 times, and plan takes it once"),
+        (("plan", "cornell_box", "-i", "nirc", "-i", "nrc"), "-i/--integrator is given 2 times, and plan takes"),
         (("scenes", "get", "bistro", "--from", "a", "--from", "b"), "--from is given 2 times, and get takes it once"),
         (("reproduce", "--quick"), "--quick is for an entry: mi-neural reproduce NAME --quick"),
         (("reproduce", "--size", "8x8", "-o", "out"), "--size is for an entry: mi-neural reproduce NAME --size"),
@@ -340,11 +340,11 @@ def test_home_is_found_where_the_shell_did_not_write_it(monkeypatch):
     Path("home/cornell.xml").write_bytes(scenes.path("cornell_box").read_bytes())
     run("render", "~/cornell.xml", *SMALL, "-i", "path", "--spp", 1, "--reference", "~/a/b.exr", "-o", "~/a/c.exr")
     run("reproduce", "nothing", "-o", "~/out", code=2)
-    assert sorted(os.listdir("home")) == ["a", "b.json", "cornell.xml"] and sorted(os.listdir("home/a")) == ["b.exr", "c.exr"]
-    assert os.listdir() == ["home"]
+    assert sorted(os.listdir("home")) == ["a", "b.json", "cornell.xml"] and os.listdir() == ["home"]
+    assert sorted(os.listdir("home/a")) == ["b.exr", "c.exr"]
     assert elsewhere.parse("other=~/a/b.exr,seconds=2").path == Path("home/a/b.exr")
     assert changes.bitmap("~/a/b.exr", 0, (12, 16, 3)).shape == (12, 16, 3)
-    with pytest.raises(load.InputError, match="no scene file '~nobody-here/a.xml'"):
+    with pytest.raises(load.InputError, match=r"no scene file '~nobody-here/a.xml'"):
         load.find_scene("~nobody-here/a.xml")
 
 

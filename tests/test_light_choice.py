@@ -551,8 +551,8 @@ def test_random_numbers_of_large_groups_have_further_bits(kind, swarm, monkeypat
     sampler.resamples = False
     for few in (2**12, 16):
         monkeypatch.setattr(sampling, "FEW_LIGHTS", few)
-        rng = uniforms(256)
-        sampler.choose(place(PLACES[0][0], 256), mi.Vector3f(0, 0, 1), mi.Bool(False), mi.Float(0.3), rng, mi.UInt32(0), mi.Bool(True))
+        at_point = place(PLACES[0][0], 256), mi.Vector3f(0, 0, 1), mi.Bool(False)
+        sampler.choose(*at_point, mi.Float(0.3), uniforms(256), mi.UInt32(0), mi.Bool(True))
     (coarse, fine) = (np.unique(u + np.zeros(256, np.float32)) for u in seen)
     assert len(coarse) == 1 and len(fine) > 2 and np.ptp(fine) < 1e-5 and (fine >= coarse[0]).all()
 
