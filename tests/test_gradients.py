@@ -363,7 +363,9 @@ def test_gradients_are_recorded_once():
         raise RuntimeError("another thread freed memory while a function was recorded")
 
     recorded = integrator.film_state.passes.recorded
-    recorded |= {k: disturbed for k in recorded if k[0] == "adjoint"}  # it is called as it is, once
+    recorded |= {k: disturbed for k in recorded if k[0] == "adjoint"}
+    with pytest.raises(RuntimeError, match=r"^nirc: another thread .*; set them to zero and compute them again"):
+        gradients_of(scene, params, keys, integrator, 4, 2)
     np.testing.assert_allclose(replayed, gradients_of(scene, params, keys, integrator, 4, 2), rtol=1e-3, atol=1e-5)
     integrator.records = False
     np.testing.assert_allclose(replayed, gradients_of(scene, params, keys, integrator, 4, 2), rtol=1e-3, atol=1e-5)

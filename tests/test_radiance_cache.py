@@ -181,20 +181,6 @@ def test_frozen_dispatches_are_the_plain_ones():
     assert caches[0].statistics["loss"] == pytest.approx(caches[1].statistics["loss"], rel=1e-3)
 
 
-def test_dispatches_that_cannot_be_recorded_are_called_as_they_are():
-    def disturbed(*_):
-        raise RuntimeError("another thread freed memory while a function was recorded")
-
-    caches = make_cache(), make_cache()
-    for cache in caches:
-        train(cache, 1)
-    for recorded in (caches[0]._training, caches[0]._inference):
-        recorded |= dict.fromkeys(recorded, disturbed)
-    for cache in caches:
-        train(cache, 1)
-    assert not caches[0]._training and close(*(c.field for c in caches))
-
-
 def test_learning_rate_is_the_default_or_the_override():
     def moved(flags, **kw):
         cache = make_cache(scale=1.0)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render.frozen import call
+from ..render.frozen import undisturbed
 from .field import CacheFileError
 from .optimizer import own_copy
 from .outgoing_field import OutgoingField, OutgoingShape
@@ -225,26 +225,25 @@ class RadianceCache:
         if not count:
             return points.zeros()
         width = self._bucket(count, self.max_inference_sample_count)
-        plain = _inference_of(width)
         if width not in self._inference:
-            self._inference[width] = dr.freeze(plain, auto_opaque=False)
+            self._inference[width] = dr.freeze(_inference_of(width), auto_opaque=False)
         flat = points.flat(width, count)
-        with dr.suspend_grad():
-            radiance, self._bad_inference = call(
-                self._inference, width, plain, self.field, flat, dr.opaque(mi.UInt32, count), self._bad_inference
+        with dr.suspend_grad(), undisturbed():
+            radiance, self._bad_inference = self._inference[width](
+                self.field, flat, dr.opaque(mi.UInt32, count), self._bad_inference
             )
         self._counts["inference_samples"] += count
         return points.answer(radiance, width)
 
     def _train(self, records: _Buffer, targets: _Buffer, count: int, rate: float, smoothing: float) -> None:
         width = self._bucket(count, self.max_training_sample_count)
-        plain = _training_of(width)
         if width not in self._training:
-            self._training[width] = dr.freeze(plain, auto_opaque=False)
-        self._loss, self._bad_training = call(
-            self._training, width, plain, self.field, records.flat(width, count), targets.flat(width, count),
-            dr.opaque(mi.UInt32, count), dr.opaque(mi.Float, rate), dr.opaque(mi.Float, smoothing), self._bad_training,
-        )  # fmt: skip
+            self._training[width] = dr.freeze(_training_of(width), auto_opaque=False)
+        with undisturbed():
+            self._loss, self._bad_training = self._training[width](
+                self.field, records.flat(width, count), targets.flat(width, count), dr.opaque(mi.UInt32, count),
+                dr.opaque(mi.Float, rate), dr.opaque(mi.Float, smoothing), self._bad_training,
+            )  # fmt: skip
         self.field.steps += 1
         self._counts["steps"] += 1
         self._counts["training_samples"] += count
