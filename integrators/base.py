@@ -14,12 +14,11 @@ from mi_neural.integrators.checks import (
     check_phase_functions,
     check_spp,
     refuse_medium_of,
-    sensor_of,
 )
 from mi_neural.integrators.keys import Keys
 from mi_neural.render import path as paths
 from mi_neural.render.binding import BoundScene
-from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage
+from mi_neural.render.film import PASS_SAMPLES, Area, Passes, RaySensor, Samples, coverage, sensor_of
 from mi_neural.render.frozen import LOCK, can_freeze_scene, is_recording, undisturbed
 from mi_neural.render.media import Media
 from mi_neural.render.sampling import PathSampler
@@ -207,11 +206,12 @@ class FilmIntegrator(mi.SamplingIntegrator):
         `total`: samples a pixel of the whole image. `settings`: in place of the integrator's own. `sums`: add the
         samples of each pixel up, whatever the film's filter. `sequence`: seed of the stratified numbers, if another.
         """
-        numbers = (first_sample, sizes[1], first_row, sizes[0])
+        spp = self.planned_spp or total or sizes[1]
+        numbers = (first_sample, sizes[1], first_row, sizes[0], spp)
         sequence = seed if sequence is None else sequence
         samples = Samples(as_seed(seed), as_seed(sequence), *(dr.opaque(mi.UInt32, v) for v in numbers))
         if settings is None:
-            settings = self.settings(self.planned_spp or total or sizes[1])
+            settings = self.settings(spp)
         keys = tuple((k, v) for k, v in vars(self).items() if isinstance(v, (bool, int, float, str)))
         place, values, n_bad = self.film_state.passes.run(
             self.film_state.estimate_of(self), {n: self.CHANNELS[n] for n in self.channels}, keys, scene, sensor,

@@ -94,7 +94,13 @@ def no_gradients_in_media(plugin: str) -> RuntimeError:
 
 
 def _check_emitter(emitter, plugin: str) -> None:
-    """Refuse a light that is not finite: no choice of lights has a probability then, and every pixel is lost."""
+    """Refuse a light that is not finite: no choice of lights has a probability then, and every pixel is lost. And one
+    that Mitsuba 3.9.1 cannot evaluate inside of recorded loops (`path` fails, too); to try it may end the process."""
+    if emitter.class_name() == "TimedSunskyEmitter":
+        raise ValueError(
+            f"{plugin}: emitter '{emitter.id()}' is a timed_sunsky, which Mitsuba 3.9.1 cannot evaluate in symbolic "
+            'loops, also those of path; use <emitter type="sunsky"/> at one time (keys year, month, day, hour, ...)'
+        )
     shape = emitter.get_shape()
     parts = [(f"emitter '{emitter.id()}'", mi.traverse(emitter), "")]
     if shape is not None and shape.is_mesh():
@@ -148,19 +154,3 @@ def _free_memory() -> int | None:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
         return None
-
-
-def sensor_of(scene, sensor, plugin: str):
-    """The sensor of that number, or the sensor given. Raises ValueError where there is none."""
-    if isinstance(sensor, mi.Sensor):
-        return sensor
-    if not hasattr(sensor, "__index__"):
-        raise ValueError(f"{plugin}: sensor is {sensor!r}; give its number in the scene, or a sensor")
-    if not scene.sensors():
-        raise ValueError(
-            f"{plugin}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>, or give one to "
-            "mi.render(scene, sensor=...)"
-        )
-    if not 0 <= sensor < len(scene.sensors()):
-        raise ValueError(f"{plugin}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
-    return scene.sensors()[sensor]

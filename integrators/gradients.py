@@ -29,7 +29,7 @@ from mi_neural.integrators.checks import no_gradients_in_media
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.film import PACKET, PASS_SAMPLES, Area, Samples, camera_rays
-from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_lights, is_recording, undisturbed
+from mi_neural.render.frozen import LOCK, can_freeze, can_freeze_lights, disturbed, is_recording, undisturbed
 from mi_neural.render.media import media_of
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
@@ -153,7 +153,7 @@ def backward(integrator, scene, grad_in, sensor, seed, spp: int) -> None:
     # to them once, and those of later parts of a path or of later passes would be lost
     with dr.isolate_grad():
         for first, n in _passes(area, spp):
-            samples, n_lanes = _samples(area, seed, first, n)
+            samples, n_lanes = _samples(area, seed, first, n, spp)
             place, active = _places(area, samples, n_lanes)
             with dr.resume_grad():
                 δL = dr.zeros(mi.Spectrum, n_lanes)
@@ -172,7 +172,7 @@ def forward(integrator, scene, sensor, seed, spp: int):
     """The image's derivative along the gradients that the scene's parameters have; a tensor of the image's shape."""
     area, parts = Area.of(sensor), []
     for first, n in _passes(area, spp):
-        samples, n_lanes = _samples(area, seed, first, n)
+        samples, n_lanes = _samples(area, seed, first, n, spp)
         place, active = _places(area, samples, n_lanes)
         δL = _trace_pass(integrator, dr.ADMode.Forward, scene, sensor, area, samples, n_lanes, None)
         dr.eval(place, δL, active)
@@ -186,9 +186,9 @@ def _passes(area: Area, spp: int):
     return [(first, min(most, spp - first)) for first in range(0, spp, most)]
 
 
-def _samples(area: Area, seed, first: int, n: int) -> tuple:
-    """(:class:`Samples` of a pass, its number of lanes)."""
-    numbers = (dr.opaque(mi.UInt32, v) for v in (first, n, 0, area.height))
+def _samples(area: Area, seed, first: int, n: int, spp: int) -> tuple:
+    """(:class:`Samples` of a pass of an image of `spp` samples a pixel, its number of lanes)."""
+    numbers = (dr.opaque(mi.UInt32, v) for v in (first, n, 0, area.height, spp))
     return Samples(seed, seed, *numbers), -(-area.n_pixels // PACKET) * PACKET * n
 
 
@@ -222,7 +222,7 @@ def _trace_pass(integrator, mode, scene, sensor, area: Area, samples: Samples, n
         pixel, sample, active = samples.lanes(area, n_lanes)
         ray, weight, _, sampler = camera_rays(sensor, area, pixel, samples.sampler(pixel, sample, SALT))
         δL = dr.zeros(mi.Spectrum, n_lanes) if δL is None else δL * weight
-        ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
+        samples.scale_differentials(ray)
         δL = adjoint(held(), mode, scene, lights, field, sampler, ray, δL, active)
         return δL * weight if mode == dr.ADMode.Forward else None
 
@@ -235,8 +235,19 @@ def _trace_pass(integrator, mode, scene, sensor, area: Area, samples: Samples, n
     limits = integrator.max_depth, integrator.rr_depth, integrator.hide
     key = ("adjoint", area, n_lanes, sensor.class_name(), *limits)
     recorded = state.passes.recorded.setdefault(key, dr.freeze(trace_pass))
-    with undisturbed():
-        return recorded(*arguments)
+    try:
+        with undisturbed():
+            return recorded(*arguments)
+    except RuntimeError as e:
+        if not disturbed(e):
+            raise
+        # Not as :func:`.frozen.call`, without a recording: this one fails at its end, when its gradients have been
+        # added, and they would be added twice (measured: in 5 of 25 calls beside a thread that loads scenes)
+        del state.passes.recorded[key]
+        raise RuntimeError(
+            f"{integrator.plugin}: another thread made or freed something of Mitsuba's while gradients were recorded; "
+            "set them to zero and compute them again"
+        ) from e
 
 
 # -----------------------------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ INCIDENT_KEYS = """
 INCIDENT_PRESETS = """
     Constants of ``paper`` / ``measured``, and the measurement that led from one to the other. The former are those of
     Dereviannykh et al. 2025 and of the authors' published configuration, for ``reliability`` and the keys that begin
-    with it those of Klepikov et al.:
+    with it (``nirc``) those of Klepikov et al.:
 
     - ``loss``, ``epsilon``: weighted, 0.001 / local, 10 / relative to the prediction in each direction a sunlit
       courtyard is 5.5 % too dark, by the local mean within 0.3 %; with an epsilon of 0.03 a room lit through a slit
@@ -55,7 +55,8 @@ INCIDENT_PRESETS = """
     - ``train_vertices``: 4 (records at up to 3) / 8 / 8 instead of 5: FLIP of the cache alone 0.151 to 0.134.
     - ``termination`` (``nirc``): balanced / adaptive / less bias with more samples, see above; of two-level: ``alpha``
       1 / measured by scene / with 1 and one residual path no variance was gained at equal samples.
-    - ``reliability``: correlation / evidence / steady flicker of the blend, over that of the average, 50 / 1.00.
+    - ``reliability`` (``nirc``): correlation / evidence / steady flicker of the blend, over that of the average, 50 /
+      1.00.
     - ``reliability_decay``, ``reliability_warm_up``, ``reliability_kappa``: 0.9, 128, 4 in both presets; λ counts
       frames, not records.
     - Not printed, so ours in both: ``cache_samples``, ``train_frames``, ``train_steps``, ``hashmap_size``, the grid's

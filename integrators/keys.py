@@ -54,6 +54,12 @@ class Keys:
         if not ok:
             raise ValueError(f"{self.props.plugin_name()}: {name} is {value!r}; give {kind}")
 
+    def refuse(self, names: tuple[str, ...], where: str) -> None:
+        """Raise ValueError for a key that this plugin does not have and others do; `where`: which."""
+        for name in names:
+            if name in self:
+                raise ValueError(f"{self.plugin_name()}: it has no key '{name}'; {where}")
+
     def __contains__(self, name: str) -> bool:
         return name in self.props
 
@@ -84,8 +90,9 @@ def older_name(keys: Keys):
     if "preset" in keys:
         raise ValueError(f"{name}: termination 'auto' is neural_path, which has no preset; leave one of the two out")
     mi.Log(mi.LogLevel.Warn, f"mi_neural: {name} with termination='auto' is now a plugin; type: neural_path")
-    wanted = {key: keys[key] for key in keys.props.keys() if key not in WITHOUT_MEANING}
-    for key in WITHOUT_MEANING:
+    dropped = WITHOUT_MEANING + (BLEND_NAMES if keys.get("blend", "ema") == "ema" else ())
+    wanted = {key: keys[key] for key in keys.props.keys() if key not in dropped}
+    for key in dropped:
         keys.get(key, None)
     if name == "nirc":
         if (kind := keys.get("cache", "plan")) not in ("plan", "network"):
@@ -96,6 +103,45 @@ def older_name(keys: Keys):
         if "learning_rate" in wanted:  # that of an incident cache
             wanted["learning_rate"] *= 6.0
     return mi.load_dict({"type": "neural_path", **wanted})
+
+
+#: Keys of integrators that may query the weights being trained, and their rows.
+BLEND_NAMES = (
+    "blend", "reliability", "reliability_normals", "reliability_decay",
+    "reliability_warm_up", "reliability_kappa", "reliability_epsilon", "reliability_resolution",
+)  # fmt: skip
+BLEND_KEYS = """
+     * - blend
+       - |string|
+       - Which weights queries use. ``ema``: their average over training frames; least noise, but late after a change.
+         ``fast``: the weights being trained. ``reliability``: (1 - σ) times the average's prediction plus σ times that
+         of the trained weights; σ depends on the place and on how well both agree with the training records. It
+         follows a change as ``fast`` does, with the noise of ``ema`` elsewhere. ``switch``: the same with σ rounded to
+         0 or 1. In scenes that do not change ``ema`` is best. (Default: ema)
+     * - reliability
+       - |string|
+       - How σ is computed: ``evidence`` (a test whether the trained weights are better), ``correlation`` (as
+         published), ``concordance``, ``regression``. (Default: evidence)
+     * - reliability_normals
+       - |bool|
+       - Keep statistics apart by the six main directions of the normal. (Default: false)
+     * - reliability_decay
+       - |float|
+       - Decay λ of the statistics per frame, in [0, 1). (Default: 0.9)
+     * - reliability_warm_up
+       - |int|
+       - Number K of training frames at the start in which σ stays 0. (Default: 128)
+     * - reliability_kappa
+       - |float|
+       - How sharply σ decides: factor κ of the difference between the two predictors' ``correlation`` or
+         ``concordance`` with the records. (Default: 4)
+     * - reliability_epsilon
+       - |float|
+       - Constant ε that ``correlation`` and ``concordance`` add to variances, in units of the squared mean radiance of
+         the scene. (Default: 0.001)
+     * - reliability_resolution
+       - |int|
+       - Number of cells of the statistics along the longest axis of the box of the records. (Default: 16)"""
 
 
 SHARED_KEYS = (
@@ -164,41 +210,10 @@ SHARED_KEYS = (
      * - hidden_layers
        - |int|
        - Number of hidden layers. (Default: 2)
-     * - blend
-       - |string|
-       - Which weights queries use. ``ema``: their average over training frames; least noise, but late after a change.
-         ``fast``: the weights being trained. ``reliability``: (1 - σ) times the average's prediction plus σ times that
-         of the trained weights; σ depends on the place and on how well both agree with the training records. It
-         follows a change as ``fast`` does, with the noise of ``ema`` elsewhere. ``switch``: the same with σ rounded to
-         0 or 1. In scenes that do not change ``ema`` is best. ``neural_path`` has ``ema`` alone. (Default: ema)
-     * - reliability
-       - |string|
-       - How σ is computed: ``evidence`` (a test whether the trained weights are better), ``correlation`` (as
-         published), ``concordance``, ``regression``. (Default: evidence)
-     * - reliability_normals
-       - |bool|
-       - Keep statistics apart by the six main directions of the normal. (Default: false)
-     * - reliability_decay
-       - |float|
-       - Decay λ of the statistics per frame, in [0, 1). (Default: 0.9)
-     * - reliability_warm_up
-       - |int|
-       - Number K of training frames at the start in which σ stays 0. (Default: 128)
-     * - reliability_kappa
-       - |float|
-       - How sharply σ decides: factor κ of the difference between the two predictors' ``correlation`` or
-         ``concordance`` with the records. (Default: 4)
-     * - reliability_epsilon
-       - |float|
-       - Constant ε that ``correlation`` and ``concordance`` add to variances, in units of the squared mean radiance of
-         the scene. (Default: 0.001)
-     * - reliability_resolution
-       - |int|
-       - Number of cells of the statistics along the longest axis of the box of the records. (Default: 16)
      * - last_rate
        - |float|
-       - Share of ``learning_rate`` at the end of its fall. (Default: 0.1 with ``ema``, else 1, so that the trained
-         weights follow a change)
+       - Share of ``learning_rate`` at the end of its fall. (Default: 0.1; with a ``blend`` other than ``ema`` 1, so
+         that the trained weights follow a change)
 """
     + LIGHT_SAMPLER_KEY.strip("\n")
     + """

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mi_neural import plan
-from mi_neural.caches.blend import BLENDS
 from mi_neural.caches.incident import IncidentCache, Training
-from mi_neural.caches.reliability import MEASURES, Reliability
 from mi_neural.caches.weights import FieldShape
 from mi_neural.integrators import planning
 from mi_neural.integrators.base import FilmIntegrator
+from mi_neural.integrators.blending import Blending
+from mi_neural.integrators.keys import BLEND_NAMES
 
 #: `train_samples` that stands for a training path for each tile of so many pixels a side.
 BY_TILES, TILE = -1, 8
@@ -35,9 +35,9 @@ class LearningIntegrator(FilmIntegrator):
         self._check(self.seed >= 0, f"seed is {self.seed}; it must be 0 or more")
         self.plan_mode = props.get("plan", "scene")
         self._check(self.plan_mode in plan.MODES, f"plan is '{self.plan_mode}'; give one of: {', '.join(plan.MODES)}")
-        blend = props.get("blend", self.default_blend(props))
+        blending = self.blending(props)
         try:
-            training = self._training(props, blend)
+            training = self._training(props, blending)
             sizes = {"levels": props.get("levels", None), "hashmap_size": props.get("hashmap_size", None),
                      "width": props.get("width", None), "hidden_layers": props.get("hidden_layers", None)}  # fmt: skip
             self.given = {k: v for k, v in sizes.items() if v is not None}
@@ -46,39 +46,24 @@ class LearningIntegrator(FilmIntegrator):
         except ValueError as e:
             message = str(e).removeprefix(f"{self.plugin}: ")
             raise ValueError(f"{self.plugin}: {_in_keys(message)}") from None
-        self._check(blend in BLENDS, f"blend is '{blend}'; give one of: {', '.join(BLENDS)}")
-        self.cache = IncidentCache(training, shape, seed=self.seed, blend=blend, reliability=self._reliability(props))
+        self.cache = IncidentCache(
+            training, shape, seed=self.seed, blend=blending.blend, reliability=blending.reliability
+        )
 
-    def _training(self, props, blend: str) -> Training:
+    def _training(self, props, blending: Blending) -> Training:
         """Constants of training; ValueError, in the words of their fields, for one out of range."""
         n_paths = props.get("train_samples", self.default_paths())
         self.by_tiles = n_paths == BY_TILES
         return Training(
             n_paths=self.default_paths() if self.by_tiles else n_paths,
             n_vertices=props.get("train_vertices", 8),
-            learning_rate=props.get("learning_rate", self.default_rate(blend)),
-            last_rate=props.get("last_rate", 0.1 if blend == "ema" or "blend" not in props else 1.0),
+            learning_rate=props.get("learning_rate", self.default_rate(blending.blend)),
+            last_rate=props.get("last_rate", blending.last_rate),
             ema_decay=props.get("ema_decay", 0.99),
             ema_debiased=props.get("ema_debiased", False),
             epsilon=props.get("epsilon", self.default_epsilon()),
             **self.training_keys(props),
         )
-
-    def _reliability(self, props) -> Reliability:
-        """Constants of the statistics by which two sets of weights are blended."""
-        measure = props.get("reliability", "evidence")
-        self._check(measure in MEASURES, f"reliability is '{measure}'; give one of: {', '.join(MEASURES)}")
-        try:
-            return Reliability(
-                measure=measure, split_normals=props.get("reliability_normals", False),
-                decay=props.get("reliability_decay", Reliability.decay),
-                warm_up=props.get("reliability_warm_up", Reliability.warm_up),
-                kappa=props.get("reliability_kappa", Reliability.kappa),
-                epsilon=props.get("reliability_epsilon", Reliability.epsilon),
-                resolution=props.get("reliability_resolution", Reliability.resolution),
-            )  # fmt: skip
-        except ValueError as e:
-            raise ValueError(f"{self.plugin}: reliability_{e}") from None
 
     def fit_paths(self, sensor) -> None:
         """With `train_samples` = -1, as many training paths as the film has tiles, but two at least."""
@@ -105,9 +90,10 @@ class LearningIntegrator(FilmIntegrator):
         """The constant of the loss where no key says it."""
         return Training.epsilon
 
-    def default_blend(self, props) -> str:
-        """Which weights answer where no key says it."""
-        return "ema"
+    def blending(self, props) -> Blending:
+        """Which weights answer queries. Refuses the keys that say it, where the average always does."""
+        props.refuse(BLEND_NAMES, "nirc and nrc have it")
+        return Blending()
 
     def default_paths(self) -> int:
         """Training paths a step where no key says it."""

@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.integrators.base import FilmIntegrator, Nonfinite
-from mi_neural.integrators.checks import check_scene, sensor_of
+from mi_neural.integrators.checks import check_scene
 from mi_neural.integrators.gradients import moved, name_black_lamps
 from mi_neural.integrators.planning import exact_sampler
 from mi_neural.render.binding import BoundScene
-from mi_neural.render.film import recordable
+from mi_neural.render.film import recordable, sensor_of
 from mi_neural.render.frozen import LOCK, locked
 
 

@@ -66,7 +66,6 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         self.denoised = props.get("denoised", False)
         if self.denoised and "spread_threshold" not in props:
             self.spread_threshold = DENOISED_THRESHOLD
-        self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; neural_path needs 'ema'")
         n = self.cache.training.n_paths
         self._check(n > 1, f"train_samples is {n}; training paths come in pairs, at least 2")
         self.cache = MeasuredCache(self.outgoing_training(), OutgoingShape.like(self.cache.shape), self.seed)
@@ -236,7 +235,7 @@ NeuralPathIntegrator.__doc__ = (
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
-    polarization, spectral rendering, and ``blend`` other than ``ema`` (use ``nrc``).
+    polarization, spectral rendering, and predictions by the weights being trained (``blend`` of ``nrc``).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.

@@ -18,8 +18,9 @@ from mi_neural.caches.spatial_hash import SpatialHashCache
 from mi_neural.estimators import spread
 from mi_neural.estimators.spread import SHARP_PDF
 from mi_neural.integrators import stopping
+from mi_neural.integrators.blending import Blending, blending_of
 from mi_neural.integrators.incident import INCIDENT_KEYS, INCIDENT_PRESETS, IncidentIntegrator
-from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
+from mi_neural.integrators.keys import BLEND_KEYS, SHARED_KEYS, older_name, register
 from mi_neural.integrators.planning import SIZES
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
@@ -93,8 +94,8 @@ class NIRCIntegrator(IncidentIntegrator):
             raise ValueError(f"{self.plugin}: {e}") from None
         self.cache = control(known.training, shape, self.seed, blend=known.blend, reliability=known.reliability)
 
-    def default_blend(self, props) -> str:
-        return "reliability" if self.plan_mode == "everything" else "ema"
+    def blending(self, props) -> Blending:
+        return blending_of(props, "reliability" if self.plan_mode == "everything" else "ema")
 
     def use_cache(self, cache) -> None:
         """Train and ask `cache` from now on; it starts anew, with the constants of training that it was made with.
@@ -398,6 +399,7 @@ NIRCIntegrator.__doc__ = (
        - |float|
        - Samples a pixel, beyond the first, at which ``adaptive`` gathers half of the far light. (Default: 4)"""
     + INCIDENT_KEYS
+    + BLEND_KEYS
     + SHARED_KEYS
     + INCIDENT_PRESETS
     + r"""

@@ -45,7 +45,6 @@ class NIRCTwoLevelIntegrator(IncidentIntegrator):
             "roulette": props.get("roulette", None), "guide": props.get("guide", None),
         }  # fmt: skip
         self._check(self.mode in MODES, f"mode is '{self.mode}'; give one of: {', '.join(MODES)}")
-        self._check(self.cache.blend == "ema", f"blend is '{self.cache.blend}'; the two-level estimator needs 'ema'")
         if self.ris:
             self._check(given["residual_samples"] in (None, 1),
                         "ris chooses one direction; leave residual_samples at 1")  # fmt: skip

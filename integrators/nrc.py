@@ -7,7 +7,8 @@ from mi_neural.caches import presets
 from mi_neural.caches.blend import OutgoingBlend, sigma_channels
 from mi_neural.caches.outgoing import OutgoingCache
 from mi_neural.caches.outgoing_field import OutgoingShape
-from mi_neural.integrators.keys import SHARED_KEYS, older_name, register
+from mi_neural.integrators.blending import Blending, blending_of
+from mi_neural.integrators.keys import BLEND_KEYS, SHARED_KEYS, older_name, register
 from mi_neural.integrators.outgoing import OUTGOING_KEYS, OutgoingIntegrator
 from mi_neural.render import prefix
 from mi_neural.render.kernels import end_kernel
@@ -26,8 +27,8 @@ class NRCIntegrator(OutgoingIntegrator):
             reliability=self.cache.reliability,
         )  # fmt: skip
 
-    def default_blend(self, props) -> str:
-        return "reliability" if self.plan_mode == "everything" else "ema"
+    def blending(self, props) -> Blending:
+        return blending_of(props, "reliability" if self.plan_mode == "everything" else "ema")
 
     @property
     def caches(self) -> tuple[str, ...]:
@@ -123,6 +124,7 @@ NRCIntegrator.__doc__ = (
        - What the cache holds. ``reflected``: all reflected light. ``indirect``: without direct light, which is traced
          at the terminal vertex too: less bias, for one more bounce. (Default: reflected)"""
     + OUTGOING_KEYS
+    + BLEND_KEYS
     + SHARED_KEYS
     + r"""
     Constants of ``paper`` / ``measured``, and the measurement that led from one to the other. The former are those of

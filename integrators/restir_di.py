@@ -10,7 +10,7 @@ from mi_neural.emitters.common import edits_of
 from mi_neural.integrators import restir_reuse as reuse
 from mi_neural.integrators import restir_samples as samples
 from mi_neural.integrators.base import Nonfinite, refuse_gradients
-from mi_neural.integrators.checks import check_film, check_scene, check_spp, refuse_medium_of, sensor_of
+from mi_neural.integrators.checks import check_film, check_scene, check_spp, refuse_medium_of
 from mi_neural.integrators.keys import register
 from mi_neural.integrators.lighting import light_sampler_of
 from mi_neural.integrators.restir_past import Past, camera_of, nothing, reproject, slim_surface
@@ -18,7 +18,7 @@ from mi_neural.lights.sampling import PowerLights
 from mi_neural.lights.table import LightTable
 from mi_neural.render import path as paths
 from mi_neural.render import vertex
-from mi_neural.render.film import Area, camera_rays, coverage, put_in_reach, recordable
+from mi_neural.render.film import Area, camera_rays, coverage, put_in_reach, recordable, sensor_of
 from mi_neural.render.frozen import LOCK, call, can_freeze, can_freeze_scene, is_recording
 from mi_neural.render.sampling import PathSampler
 

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.bench import terminal
+from mi_neural.commands import options
 from mi_neural.commands.compare import compare
 from mi_neural.commands.doc import doc
 from mi_neural.commands.info import info
@@ -47,14 +48,14 @@ def _options(
 ) -> None: ...
 
 
-app.command()(render)
-app.command()(compare)
-app.command()(sequence)
-app.command()(reproduce)
-app.command()(plan)
+app.command(cls=options.Command)(render)
+app.command(cls=options.Command)(compare)
+app.command(cls=options.Command)(sequence)
+app.command(cls=options.Command)(reproduce)
+app.command(cls=options.Command)(plan)
 app.add_typer(scenes)
-app.command()(info)
-app.command()(doc)
+app.command(cls=options.Command)(info)
+app.command(cls=options.Command)(doc)
 
 
 def main() -> None:

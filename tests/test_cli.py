@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from fake_cache import register
 from test_benchmark import KEYS, WHITE, boxes, has_denoiser
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import mi_neural
 from mi_neural import scenes
-from mi_neural.bench import load
+from mi_neural.bench import changes, elsewhere, load
 from mi_neural.cli import app
+from mi_neural.commands import options
 from mi_neural.image import exr
 
 SMALL = ("--size", "16x12")
@@ -258,6 +260,13 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*RENDER, "-i", "path", "--set", "max_depth"), "--set takes key=value"),
         ((*RENDER, "-D", "zork=1"), "has no parameter zork"),
         ((*RENDER, "--spp", "4", "--seconds", "1"), "--spp and --seconds exclude each other"),
+        ((*RENDER, "-i", "path", "-i", "nirc"), "-i/--integrator is given 2 times, .*compare SCENE -i A -i B"),
+        ((*RENDER, "-o", "a.exr", "--output", "b.exr"), "--output/-o is given 2 times, and render takes it once"),
+        ((*RENDER, "--spp", "4", "--spp", "4", "--spp=8"), "--spp is given 3 times, and render takes it once: leave"),
+        (("plan", "cornell_box", "-i", "nirc", "-i", "nrc"), "-i/--integrator is given 2 times, and plan takes"),
+        (("scenes", "get", "bistro", "--from", "a", "--from", "b"), "--from is given 2 times, and get takes it once"),
+        (("reproduce", "--quick"), "--quick is for an entry: mi-neural reproduce NAME --quick"),
+        (("reproduce", "--size", "8x8", "-o", "out"), "--size is for an entry: mi-neural reproduce NAME --size"),
         ((*RENDER, "--spp", "0"), "--spp must be greater than 0"),
         ((*RENDER, "--spp", "-3"), "--spp must be greater than 0"),
         ((*RENDER, "--seconds", "0"), "--seconds must be greater than 0"),
@@ -291,6 +300,7 @@ COMPARE = ("compare", "cornell_box", *SMALL, "-i", "path")
         ((*COMPARE, "-o", "file/out"), "cannot write to the folder"),
         ((*COMPARE, "-o", "out", "--seconds", "1,x"), "--seconds takes seconds"),
         ((*COMPARE, "-o", "out", "--seconds", "1,-1"), "--seconds must be greater than 0"),
+        ((*COMPARE, "-o", "out", "--seconds", "1", "--seconds", "2"), "--seconds is given 2 times.*values by commas"),
         ((*COMPARE, "-o", "out", "--frame-seconds", "1"), "needs --steady"),
         ((*COMPARE, "-o", "out", "--set", "zork=1"), "none of path has a key 'zork'"),
         ((*COMPARE, "-o", "out", "--reference", "a", "--reference-spp", "4"), "exclude each other"),
@@ -314,6 +324,30 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, message):
     assert len(errors) == 1 and errors[0] == lines[-1] and "Traceback" not in result.output
     assert __import__("re").search(message, errors[0]), errors[0]
     assert not [f for f in os.listdir() if f.endswith((".png", "_path.exr"))]
+
+
+def test_no_command_drops_an_option_that_is_given_twice():
+    def commands(group):
+        for command in group.commands.values():
+            yield from commands(command) if hasattr(command, "commands") else [command]
+
+    assert all(isinstance(command, options.Command) for command in commands(get_command(app)))
+    run(*RENDER, "-i", "path:max_depth=2", "--set", "rr_depth=3", "--set", "max_depth=4", "--spp", 1, "-o", "a.exr")
+
+
+def test_home_is_found_where_the_shell_did_not_write_it(monkeypatch):
+    monkeypatch.setenv("HOME", "home")
+    monkeypatch.setenv("USERPROFILE", "home")
+    run(*RENDER, "-i", "path", "--spp", 1, "-o", "~/a/b.exr", "--json", "~/b.json")
+    Path("home/cornell.xml").write_bytes(scenes.path("cornell_box").read_bytes())
+    run("render", "~/cornell.xml", *SMALL, "-i", "path", "--spp", 1, "--reference", "~/a/b.exr", "-o", "~/a/c.exr")
+    run("reproduce", "nothing", "-o", "~/out", code=2)
+    assert sorted(os.listdir("home")) == ["a", "b.json", "cornell.xml"] and os.listdir() == ["home"]
+    assert sorted(os.listdir("home/a")) == ["b.exr", "c.exr"]
+    assert elsewhere.parse("other=~/a/b.exr,seconds=2").path == Path("home/a/b.exr")
+    assert changes.bitmap("~/a/b.exr", 0, (12, 16, 3)).shape == (12, 16, 3)
+    with pytest.raises(load.InputError, match=r"no scene file '~nobody-here/a.xml'"):
+        load.find_scene("~nobody-here/a.xml")
 
 
 def test_missing_denoiser_is_said_before_rendering(monkeypatch):

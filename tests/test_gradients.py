@@ -359,6 +359,14 @@ def test_gradients_are_recorded_once():
         mi.render(scene, params, integrator=integrator, spp=1, seed=seed)
         replayed = gradients_of(scene, params, keys, integrator, 4, seed)
     assert function.n_recordings <= known + 1
+    def disturbed(*_):
+        raise RuntimeError("another thread freed memory while a function was recorded")
+
+    recorded = integrator.film_state.passes.recorded
+    recorded |= {k: disturbed for k in recorded if k[0] == "adjoint"}
+    with pytest.raises(RuntimeError, match=r"^nirc: another thread .*; set them to zero and compute them again"):
+        gradients_of(scene, params, keys, integrator, 4, 2)
+    np.testing.assert_allclose(replayed, gradients_of(scene, params, keys, integrator, 4, 2), rtol=1e-3, atol=1e-5)
     integrator.records = False
     np.testing.assert_allclose(replayed, gradients_of(scene, params, keys, integrator, 4, 2), rtol=1e-3, atol=1e-5)
     assert not np.array_equal(first, replayed)

@@ -1,5 +1,8 @@
 """Groups of lights, bounds on what they give, and how one is chosen."""
 
+import math
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -23,6 +26,7 @@ from scipy import stats
 
 from mi_neural.caches import visibility
 from mi_neural.light_noise import light_noise
+from mi_neural.lights import sampling
 from mi_neural.lights.clusters import Groups, kmeans, make_groups
 from mi_neural.lights.entries import DIRECTION, ENVIRONMENT, LOCAL
 from mi_neural.lights.importance import importance
@@ -514,6 +518,43 @@ def test_no_number_is_used_twice_by_choices_one_after_another(choosers, counted,
         np.testing.assert_array_equal(drawn, np.where(np.arange(n) % 2 == 0, several, one))
     else:
         assert (drawn >= np.where(np.arange(n) % 2 == 0, 16, 10)).all()  # one number a candidate, at least
+
+
+@pytest.mark.parametrize("n", [2**24, 2**24 - 3, 10_000_000, 2**13])
+def test_each_of_millions_of_lights_is_chosen_alike(n):
+    """By one random number, of 23 bits, every other one of 2^24 lights was never chosen. The lights between two such
+    numbers are drawn as often as they should be: chi-square, which fails in less than one of 10,000 seeds."""
+    k, draws = 2**22 + 12345, 2**14
+    sampler = UniformLights(SimpleNamespace(n_lights=n))
+    choice = sampler.choose(None, None, None, mi.Float(k / 2**23), uniforms(draws), mi.UInt32(0), mi.Bool(True))
+    index = np.array(choice.index) + np.zeros(draws, int)
+    low, high = k * n / 2**23, (k + 1) * n / 2**23
+    lights = np.arange(int(low), math.ceil(high))
+    share = np.minimum(lights + 1, high) - np.maximum(lights, low)
+    assert np.isin(index, lights).all() and int(float(choice.weight[0])) == n
+    found = np.bincount(index - lights[0], minlength=len(lights))
+    expected = draws * share / share.sum()
+    assert stats.chi2.sf(((found - expected) ** 2 / expected).sum(), max(len(lights) - 1, 1)) > 1e-4
+
+
+@pytest.mark.parametrize("kind", ["power", "clusters"])
+def test_random_numbers_of_large_groups_have_further_bits(kind, swarm, monkeypatch):
+    table = swarm[1]
+    sampler = PowerLights(table) if kind == "power" else VisibleLights(table, make_groups(table, 6, "kmeans"))
+    seen = []
+
+    def sample_light(group, u, active):
+        seen.append(np.array(u))
+        return mi.UInt32(0), mi.Float(1)
+
+    monkeypatch.setattr(sampler.groups, "sample_light", sample_light)
+    sampler.resamples = False
+    for few in (2**12, 16):
+        monkeypatch.setattr(sampling, "FEW_LIGHTS", few)
+        at_point = place(PLACES[0][0], 256), mi.Vector3f(0, 0, 1), mi.Bool(False)
+        sampler.choose(*at_point, mi.Float(0.3), uniforms(256), mi.UInt32(0), mi.Bool(True))
+    (coarse, fine) = (np.unique(u + np.zeros(256, np.float32)) for u in seen)
+    assert len(coarse) == 1 and len(fine) > 2 and np.ptp(fine) < 1e-5 and (fine >= coarse[0]).all()
 
 
 def test_the_sampler_that_was_given_is_advanced_too(swarm):

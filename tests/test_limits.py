@@ -44,6 +44,18 @@ def image(integrator, scene, **keys) -> np.ndarray:
     return found
 
 
+@pytest.mark.parametrize("pass_samples", [None, 3])
+def test_differentials_are_those_of_the_image_whatever_its_passes(scene, monkeypatch, pass_samples):
+    """As narrow as the samples of a pixel lie, as in Mitsuba's own integrators."""
+    integrator = mi.load_dict({"type": "nirc", "max_depth": 2})
+    integrator.estimate = lambda scene, lights, field, sampler, ray, settings, active: (
+        mi.Color3f(dr.norm(ray.d_x - ray.d)), mi.Bool(True), {})  # fmt: skip
+    one = image(integrator, scene, spp=1)
+    if pass_samples is not None:
+        monkeypatch.setattr(type(integrator), "PASS_SAMPLES", pass_samples * one[..., 0].size)
+    np.testing.assert_allclose(image(integrator, scene, spp=16), one / 4, rtol=0.05)
+
+
 # ---------------------------------------------------------------- size
 
 

@@ -17,6 +17,7 @@ from test_nrc import assert_like_path, constant_field
 from test_vertex import lights, test_scene
 
 from mi_neural import scenes
+from mi_neural.bench.load import InputError, IntegratorSpec, build_integrator, parse_integrator
 from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
@@ -275,11 +276,13 @@ def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     assert_same_mean(ours, known, f"nrc, c = {c}", relative=1e-5)
 
 
-@pytest.mark.parametrize("plugin, keys", [("nirc", {"light_samples": 2, "channels": "direct"}), ("nrc", {})])
+@pytest.mark.parametrize("plugin, keys", [
+    ("nirc", {"light_samples": 2, "channels": "direct"}), ("nrc", {"blend": "ema", "reliability_kappa": 3.0}),
+])  # fmt: skip
 def test_older_name_still_works_and_says_the_new_one(plugin, keys, box, capfd):
     old = mi.load_dict({"type": plugin, **SMALL, "termination": "auto", **keys})
     assert "type: neural_path" in "".join(capfd.readouterr())
-    new = auto(**({"channels": "traced"} if keys else {}))
+    new = auto(**({"channels": "traced"} if "channels" in keys else {}))
     assert type(old) is type(new) and str(old) == str(new) and old.channels == new.channels
     # Trained: equal but for the order of sums
     np.testing.assert_allclose(render(box, old, 4), render(box, new, 4), rtol=0.03, atol=1e-3)
@@ -405,13 +408,22 @@ def test_frozen_functions_are_not_recorded_again_and_preparing_changes_nothing(b
 @pytest.mark.parametrize("keys, message", [
     ({"denoised": 1}, "denoised is 1; give true or false"),
     ({"spread_threshold": -1.0}, "spread_threshold is -1"),
-    ({"blend": "fast"}, "blend is 'fast'"),
+    ({"blend": "fast"}, "neural_path: it has no key 'blend'; nirc and nrc have it"),
     ({"train_samples": 1}, "train_samples is 1"),
-    ({"blend": "reliability"}, "blend is 'reliability'"),
+    ({"reliability_decay": 0.8}, "neural_path: it has no key 'reliability_decay'; nirc and nrc have it"),
 ])  # fmt: skip
 def test_impossible_combination_is_refused(keys, message):
     with pytest.raises((ValueError, RuntimeError), match=message):
         auto(**keys)
+
+
+def test_keys_of_other_integrators_are_left_out_where_they_may_be():
+    """As `--set` gives them: to each integrator that has them."""
+    optional = {"blend": "fast", "reliability": "evidence", "width": 16}
+    assert build_integrator(IntegratorSpec("neural_path"), optional=optional)[1] == {"width": 16}
+    assert build_integrator(IntegratorSpec("nrc"), optional=optional)[1] == optional
+    with pytest.raises(InputError, match="neural_path: it has no key 'blend'; nirc and nrc have it"):
+        build_integrator(parse_integrator("neural_path:blend=fast"))
 
 
 @pytest.mark.parametrize("plugin", ["nirc", "nrc"])

@@ -16,6 +16,7 @@ from expectation import assert_same_mean, renders
 from test_incident import load
 from test_vertex import LIGHTS, lights, test_scene
 
+import mi_neural
 from mi_neural.caches.field import CacheFileError
 
 SLOW = pytest.mark.slow  # more of what the default run shows at one value
@@ -704,6 +705,10 @@ def test_camera_inside_a_medium_is_refused():
 def test_sensor_that_does_not_exist_is_refused(index):
     scene = mi.load_dict({**FLOOR, **CAMERA, **LIGHTS["constant"]})
     refused(scene, f"there is no sensor {index}; the scene has 1", index)
+    with pytest.raises(ValueError, match=f"guides: there is no sensor {index}; the scene has 1"):
+        mi_neural.guides(scene, index)
+    with pytest.raises(ValueError, match=f"live: there is no sensor {index}; the scene has 1"):
+        mi_neural.live(scene, sensor=index)
 
 
 def test_negative_sample_count_is_refused(sphere):

@@ -263,7 +263,8 @@ def test_wrapped_in_aov_it_shows_the_same_light(box, bench):
     ({"alpha": "cell", "cache_samples": 0}, "alpha is cell.*cache_samples is 0"),
     ({"cache_samples": -1}, "cache_samples is -1"), ({"residual_samples": 0}, "residual_samples is 0.*at least 1"),
     ({"mode": "best"}, "mode is 'best'.*unbiased, progressive"),
-    ({"blend": "reliability"}, "blend is 'reliability'.*'ema'"),
+    ({"blend": "reliability"}, "it has no key 'blend'; nirc and nrc have it"),
+    ({"reliability": "evidence"}, "it has no key 'reliability'; nirc and nrc have it"),
     ({"ris": True, "residual_samples": 2}, "ris chooses one direction.*residual_samples"),
     ({"channels": "cache,depht"}, "unknown channel 'depht'.*variance_indirect"), ({"max_depth": -2}, "max_depth is -2"),
 ])  # fmt: skip

@@ -176,9 +176,8 @@ def test_keys_of_reliability_reach_the_statistics():
 @pytest.mark.parametrize("kind", ["nirc", "nirc_two_level"])
 def test_keys_go_before_the_preset_of_incident_radiance(kind):
     keys = {**SMALL, "direction_degree": 1, "inputs": "roughness, normal", "loss": "local", "epsilon": 0.5,
-            "learning_rate": 0.02, "last_rate": 0.5, "ema_decay": 0.5, "ema_debiased": False, "train_vertices": 3,
-            "reliability": "regression"}  # fmt: skip
-    own = {"termination": "primary"} if kind == "nirc" else {"alpha": 0.5}
+            "learning_rate": 0.02, "last_rate": 0.5, "ema_decay": 0.5, "ema_debiased": False, "train_vertices": 3}
+    own = {"termination": "primary", "reliability": "regression"} if kind == "nirc" else {"alpha": 0.5}
     integrator = mi.load_dict({"type": kind, "preset": "paper", **keys, **own})
     shape, t = integrator.cache.shape, integrator.cache.training
     assert (shape.n_levels, shape.width, shape.n_hidden, shape.direction_degree) == (2, 8, 1, 1)

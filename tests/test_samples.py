@@ -167,7 +167,7 @@ def test_passes_with_one_sequence_are_one_set_of_stratified_numbers():
     """Four passes of 4 samples have the stratified points of one pass of 16; their independent numbers are others."""
 
     def numbers(seed, first, n):
-        samples = Samples(*(mi.UInt32(v) for v in (seed, 5, first, n, 0, 2)))
+        samples = Samples(*(mi.UInt32(v) for v in (seed, 5, first, n, 0, 2, 16)))
         pixel, sample, active = samples.lanes(area, 2 * PACKET * n)
         sampler = samples.sampler(pixel, sample, 1)
         order = np.lexsort((np.array(sample), np.array(pixel)))

@@ -11,10 +11,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_neural import parameters, plan
+from mi_neural import integrators, parameters, plan
 from mi_neural.bench.load import InputError
 from mi_neural.bench.sequence import Sequence
 from mi_neural.plan import SceneFacts
+from mi_neural.registration import plugin_names
 
 DIFFUSE = {"type": "diffuse"}
 RAMP = np.linspace(0.05, 0.6, 64).reshape(8, 8, 1).repeat(3, 2).astype(np.float32)
@@ -274,6 +275,14 @@ def lit_by(name: str, **keys) -> mi.Scene:
 LIGHTS = [name for name in plugins("Emitter") if name not in SAMPLERS]
 #: Of Mitsuba 3.9.1, which `path` cannot render either: "symbolic variables" in its own `sample_direction`.
 NOT_RENDERED = {"timed_sunsky"}
+
+
+@pytest.mark.parametrize("light", sorted(NOT_RENDERED))
+def test_lights_that_fail_in_mitsuba_are_refused_by_every_integrator(light):
+    scene = lit_by(light)
+    for name in plugin_names(integrators):
+        with pytest.raises(ValueError, match=f"^{name}: emitter 'light' is a {light}, .*; use <emitter type="):
+            mi.load_dict({"type": name}).render(scene)
 
 
 @pytest.mark.parametrize("light", [*LIGHTS, "odd_lantern"])

@@ -220,8 +220,10 @@ def plugin_class(package, name) -> type:
 
 def keys_read(cls: type) -> set[str]:
     """Keys that the modules of `cls` and of its bases in this package read from their `props`."""
-    keys = set()
-    for module in {base.__module__ for base in cls.__mro__} & set(TREES):
+    keys, modules = set(), {base.__module__ for base in cls.__mro__} & set(TREES)
+    if any("blending_of(props, " in ast.unparse(TREES[module]) for module in modules):
+        modules.add("mi_neural.integrators.blending")
+    for module in modules:
         for node in ast.walk(TREES[module]):
             if isinstance(node, ast.Call) and ast.unparse(node) == "light_sampler_of(props)":
                 keys.add("light_sampler")

@@ -67,6 +67,10 @@ def test_scenes_are_taken_once_and_named_apart(folder):
     assert len(collection.choose([str(moon), "lit_cube"], Path("scenes"))) == 3
     files = [Path("a/scene.xml"), Path("b/a.xml"), Path("c/d.xml")]
     assert collection.titles(files) == ["a_1", "a_2", "d"]
+    files = [Path("a/room.xml"), Path("b/room.xml"), Path("room_1.xml")]
+    assert collection.titles(files) == ["room_2", "room_3", "room_1"]
+    files += [Path("Room.xml"), Path("a/room_1/scene.xml")]
+    assert len({title.casefold() for title in collection.titles(files)}) == len(files)
 
 
 # ---------------------------------------------------------------- what repeats say

@@ -90,8 +90,8 @@ def test_time_ends_it_first(box):
 
 def test_command_says_what_was_reached(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = lambda *more: CliRunner().invoke(cli.app, ["render", "cornell_box", "-i", "path", "--size", "16x16", *more])  # noqa: E731
-    found = run("--until-error", "0.1", "-o", "a.exr")
+    run = lambda *more: CliRunner().invoke(cli.app, ["render", "cornell_box", "--size", "16x16", *more])  # noqa: E731
+    found = run("--until-error", "0.1", "-i", "path", "-o", "a.exr")
     assert found.exit_code == 0, found.output
     assert "estimated trimmed relMSE 0.0" in found.output and (tmp_path / "a.exr").exists()
     refused = run("--until-error", "0.1", "--spp", "4")

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import parameters
-from .load import InputError, one_line
+from .load import InputError, one_line, user_path
 
 #: New value of a parameter: function(frame, original value) -> value of the same shape.
 Function = Callable[[int, np.ndarray], np.ndarray]
@@ -396,6 +396,7 @@ def bitmap(pattern: str, frame: int, shape: tuple[int, ...]) -> np.ndarray:
         name = pattern % frame if "%" in pattern else pattern
     except (TypeError, ValueError):
         raise ValueError(f"bitmap: {pattern!r} needs one place for the frame, like picture_%04d.exr") from None
+    name = str(user_path(name))
     if not Path(name).is_file():
         raise ValueError(f"bitmap: there is no file {name}")
     if len(shape) != 3:

@@ -39,6 +39,18 @@ def choose(names: list[str] | None, folder: Path | None) -> list[Path]:
 
 
 def titles(files: list[Path]) -> list[str]:
-    """A name for each scene file, none of them twice: its own, or its folder's if it is called `scene.xml`."""
+    """A name for each scene file, none of them twice: its own, or its folder's if it is called `scene.xml`.
+
+    Files of one name are numbered, by numbers that no other file's name ends in. Names that differ in case alone count
+    as one, because some file systems make one folder of them.
+    """
     names = [file.parent.name if file.stem == "scene" else file.stem for file in files]
-    return [name if names.count(name) == 1 else f"{name}_{names[:k].count(name) + 1}" for k, name in enumerate(names)]
+    known = [name.casefold() for name in names]
+    taken, found = {name for name in known if known.count(name) == 1}, []
+    for name in names:
+        if known.count(name.casefold()) > 1:
+            numbered = (f"{name}_{n}" for n in range(1, 2 * len(files) + 1))
+            name = next(one for one in numbered if one.casefold() not in taken)
+            taken.add(name.casefold())
+        found.append(name)
+    return found

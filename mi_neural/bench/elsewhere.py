@@ -12,7 +12,7 @@ from mi_neural.image import exr, metrics
 
 from .benchmark import Picture, Row, judge
 from .budget import Rendered
-from .load import InputError, LoadedScene
+from .load import InputError, LoadedScene, user_path
 from .reference import Reference, scale_between
 
 FORM = "--image takes NAME=FILE.exr,seconds=T and, where wanted, spp=N, denoised=true, scene=NAME"
@@ -48,10 +48,10 @@ def parse(text: str) -> Image:
         raise InputError(f"{FORM}; got {text!r}")
     if given.get("denoised", "false") not in ("true", "false"):
         raise InputError(f"--image: denoised is true or false, got {given['denoised']!r}")
-    if not Path(path).is_file():
+    if not user_path(path).is_file():
         raise InputError(f"--image: no such image: {path}")
     return Image(
-        label, Path(path), _positive(given["seconds"], "seconds", text),
+        label, user_path(path), _positive(given["seconds"], "seconds", text),
         _positive(given["spp"], "spp", text) if "spp" in given else None,
         given.get("denoised") == "true", given.get("scene"),
     )  # fmt: skip

@@ -32,7 +32,7 @@ from mi_neural.scenes import public
 
 from . import checksums
 from .checksums import BLOCK
-from .load import InputError
+from .load import InputError, user_path
 
 Progress = Callable[[float, float | None], None]
 SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2")
@@ -92,7 +92,7 @@ def get(name: str, source: str | None = None, progress: Progress | None = None, 
     if source is None or source.startswith(("http://", "https://")):
         archive = download(address(scene, name, source), _part(name), progress)
     else:
-        archive = local(Path(source).expanduser(), name, scene)
+        archive = local(user_path(source), name, scene)
     if archive.is_dir():
         copied = _install(name, scene, source, accept, lambda new: shutil.copytree(archive, new, dirs_exist_ok=True))
         return Found(name, target, files=copied)

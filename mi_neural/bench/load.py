@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import os
 import re
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,6 +23,11 @@ MITSUBA_INTEGRATORS = "path direct volpath volpathmis ptracer aov depth moment s
 
 class InputError(ValueError):
     """What the user typed cannot be done; the message is one line and complete."""
+
+
+def user_path(path: str | Path) -> Path:
+    """A path as a user typed it: `~` at its start is the user's home, `~name` that of a user of this name, if any."""
+    return Path(os.path.expanduser(path))
 
 
 # ------------------------------------------------------------------------------------------------------------------
@@ -74,7 +80,7 @@ def find_scene(name: str) -> Path:
     from mi_neural import scenes
     from mi_neural.scenes import public
 
-    path = Path(name).expanduser()
+    path = user_path(name)
     if path.is_file():
         return path.resolve()
     shipped, of_others = list(scenes.names()), public.names()
@@ -369,9 +375,9 @@ def build_integrator(
             text = one_line(error)
         if f'Plugin "{spec.type}" not found' in text:
             raise InputError(f"unknown integrator {spec.type!r}; {_known_integrators()}")
-        unknown = _unreferenced(text)
-        dropped = [k for k in unknown if k in droppable and k not in spec.keys]
-        if unknown and len(dropped) == len(unknown):
+        unknown, refused = _unreferenced(text), re.findall(r": it has no key '(\w+)'; ", text)
+        dropped = [k for k in unknown + refused if k in droppable and k not in spec.keys]
+        if dropped and len(dropped) == len(unknown + refused):
             keys = {k: v for k, v in keys.items() if k not in dropped}
             continue
         if wrong := [k for k in unknown if k not in dropped]:

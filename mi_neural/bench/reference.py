@@ -22,7 +22,7 @@ from mi_neural.image import exr
 from mi_neural.image.metrics import block_means, count_nonfinite, relative_squared_errors
 
 from .budget import STREAM_REFERENCE, Progress, clock, pass_seed, pixels, render_pass
-from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, load_scene, split_channels
+from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, load_scene, split_channels, user_path
 
 #: Passes hold about this many samples and at most MAX_PASS_SPP a pixel: many passes, or there is no variance to
 #: estimate.
@@ -91,7 +91,7 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None, scaled
 
     Raises :class:`InputError` where the file is missing or no EXR, has another size, or holds NaN or infinities.
     """
-    path = Path(path).expanduser()
+    path = user_path(path)
     try:
         image = exr.read(path)
     except FileNotFoundError:

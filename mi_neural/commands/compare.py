@@ -116,7 +116,7 @@ def compare(
         keys=load.parse_keys(set_ or []),
         parameters=terminal.parse_define(define),
         sizes=terminal.parse_sizes(size),
-        reference=Path(reference) if reference else None,
+        reference=reference,
         reference_spp=reference_spp,
         reference_cache=reference_cache,
         denoise=denoise_,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,48 @@ from mi_neural.image import exr, moments
 
 #: Seconds of training after which `render` writes a first image of one sample a pixel, to be replaced by the final one.
 PREVIEW_SECONDS = 1.0
+
+
+@dataclass
+class Wanted:
+    """What was typed, as far as more than one step needs it; names as those of the options."""
+
+    spec: load.IntegratorSpec | None
+    keys: dict[str, object]
+    parameters: dict[str, str]
+    size: tuple[int, int] | None
+    spp: int | None
+    seconds: float | None
+    until_error: float | None
+    pretrain: int
+    seed: int
+    output: Path | None
+    reference: Path | None
+    denoise: bool
+    save_cache: Path | None
+    load_cache: Path | None
+    json: Path | None
+
+    def check(self) -> None:
+        """Refuse what cannot be done, before anything is loaded."""
+        if self.denoise:
+            denoise.require()
+        if self.output is not None and self.output.suffix.lower() not in (".exr", ".png"):
+            raise InputError(f"-o takes a file that ends in .exr or .png, got {self.output}")
+        if self.load_cache is not None and not self.load_cache.is_file():
+            raise InputError(f"no cache file {self.load_cache}: leave --load-cache out or write one with --save-cache")
+        for file in (self.output or Path("image.exr"), self.json, self.save_cache):
+            terminal.require_writable(file)
+
+    def check_case(self, case: benchmark.Case) -> None:
+        """Refuse what cannot be done with this integrator, and files of one name."""
+        terminal.require_cache_methods(case, self.pretrain, self.save_cache, self.load_cache)
+        if self.until_error is not None and getattr(case.integrator, "cumulative", False):
+            raise InputError("--until-error compares passes, but images of this integrator hold all passes before them")
+        files = {"-o": self.output, "--json": self.json, "--reference": self.reference}
+        # A cache may be written back
+        for more in ({"--load-cache": self.load_cache}, {"--save-cache": self.save_cache}):
+            terminal.require_different({**files, **more})
 
 
 @options.readable
@@ -66,6 +109,46 @@ def render(
     The image so far is written every minute, and after Ctrl-C. If training takes long, a first image of one sample a
     pixel is written after one second of it. With --scheduler the cache is trained here, and the workers render.
     """
+    check_budget(spp, seconds, until_error, pretrain, scheduler)
+    wanted_size, keys, parameters = (
+        terminal.parse_size(size),
+        load.parse_keys(set_ or []),
+        terminal.parse_define(define),
+    )
+    spec = load.parse_integrator(integrator) if integrator else None
+    wanted = Wanted(
+        spec, keys, parameters, wanted_size, spp, seconds, until_error, pretrain, seed, output, reference, denoise_,
+        save_cache, load_cache, json_,
+    )  # fmt: skip
+    wanted.check()
+
+    terminal.set_variant(variant)
+    loaded, case = load_case(scene, wanted)
+    wanted.output = wanted.output or Path(f"{loaded.name}_{case.spec.type}.exr")
+    wanted.check_case(case)
+    ref = references.of_film(reference, loaded) if reference else None
+    terminal.depth_notes(ref, loaded, [case])
+    if ref is not None and (note := references.scale_note(ref, loaded.size)):
+        terminal.announce(note)
+    terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
+
+    job = Job(wanted, loaded, case)
+    with terminal.Bars() as bars, connect(scheduler) as workers:
+        job.prepare(bars, workers)
+        stopped = job.train(bars)
+        rendered = job.render(bars, workers, stopped)
+        image, seconds_denoise = job.denoised(rendered)
+    job.write(rendered, image, seconds_denoise, ref)
+    if rendered.problem:
+        raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {job.n} samples a pixel")
+    if rendered.interrupted:
+        raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")
+
+
+def check_budget(
+    spp: int | None, seconds: float | None, until_error: float | None, pretrain: int, scheduler: str | None
+) -> None:  # fmt: skip
+    """Refuse numbers of samples, seconds and frames that are out of range or exclude each other."""
     if spp is not None and seconds is not None:
         raise InputError("--spp and --seconds exclude each other: give one of them")
     if scheduler is not None and seconds is not None:
@@ -77,148 +160,160 @@ def render(
         raise InputError("--until-error chooses the samples itself: leave out --spp and --scheduler")
     if pretrain < 0:
         raise InputError(f"--pretrain takes a number of frames from 0, got {pretrain}")
-    wanted_size, keys, parameters = (
-        terminal.parse_size(size),
-        load.parse_keys(set_ or []),
-        terminal.parse_define(define),
-    )
-    spec = load.parse_integrator(integrator) if integrator else None
-    if denoise_:
-        denoise.require()
-    if output is not None and output.suffix.lower() not in (".exr", ".png"):
-        raise InputError(f"-o takes a file that ends in .exr or .png, got {output}")
-    if load_cache is not None and not load_cache.is_file():
-        raise InputError(f"no cache file {load_cache}: leave --load-cache out or write one with --save-cache")
-    for file in (output or Path("image.exr"), json_, save_cache):
-        terminal.require_writable(file)
 
-    terminal.set_variant(variant)
-    loaded = load.load_scene(scene, wanted_size, parameters, None if spec else keys)
-    if spec:
-        spec.keys = {**keys, **spec.keys}
-        case = benchmark.make_cases(loaded, [spec], denoise=denoise_)[0]
-    else:
-        case = benchmark.own_case(loaded, keys)
-    terminal.require_cache_methods(case, pretrain, save_cache, load_cache)
-    if until_error is not None and getattr(case.integrator, "cumulative", False):
-        raise InputError("--until-error compares passes, but images of this integrator hold all passes before them")
-    output = output or Path(f"{loaded.name}_{case.spec.type}.exr")
-    files = {"-o": output, "--json": json_, "--reference": Path(reference) if reference else None}
-    for more in ({"--load-cache": load_cache}, {"--save-cache": save_cache}):  # a cache may be written back
-        terminal.require_different({**files, **more})
-    ref = references.of_film(reference, loaded) if reference else None
-    terminal.depth_notes(ref, loaded, [case])
-    if ref is not None and (note := references.scale_note(ref, loaded.size)):
-        terminal.announce(note)
-    terminal.announce(f"{loaded.name} {loaded.size[0]}x{loaded.size[1]}, {case.spec.label}, {variant}")
 
-    seconds_pretrain, seconds_preview, first_image, estimate = 0.0, 0.0, None, None
+def load_case(scene: str, wanted: Wanted) -> tuple[load.LoadedScene, benchmark.Case]:
+    """The scene, and the integrator that was named or is the scene's own."""
+    spec, keys = wanted.spec, wanted.keys
+    loaded = load.load_scene(scene, wanted.size, wanted.parameters, None if spec else keys)
+    if not spec:
+        return loaded, benchmark.own_case(loaded, keys)
+    spec.keys = {**keys, **spec.keys}
+    return loaded, benchmark.make_cases(loaded, [spec], denoise=wanted.denoise)[0]
 
-    def describe(rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
+
+@dataclass
+class Job:
+    """One image under way.
+
+    n           samples a pixel, where no clock and no error decides
+    guides      of the denoiser
+    seconds_*   of pretraining, of training before the first sample, of previews in it
+    first_image seconds from the start of the process to the first image that was written
+    estimate    of the error, with `--until-error`
+    """
+
+    wanted: Wanted
+    loaded: load.LoadedScene
+    case: benchmark.Case
+    n: int = 0
+    guides: object = None
+    seconds_pretrain: float = 0.0
+    seconds_first: float = 0.0
+    seconds_preview: float = 0.0
+    first_image: float | None = None
+    estimate: object = None
+
+    @property
+    def subject(self) -> tuple:
+        return self.loaded.scene, self.case.integrator
+
+    def prepare(self, bars: terminal.Bars, workers) -> None:
+        """Render the denoiser's guides, compile, and read the cache."""
+        wanted, (scene, integrator) = self.wanted, self.subject
+        if wanted.denoise:
+            bars("guides for the denoiser")
+            self.guides, _ = denoise.render_guides(scene, wanted.seed)
+            denoise.warm_up(self.guides)
+        self.n = wanted.spp or self.loaded.default_spp
+        if workers is None:
+            bars("compiling")
+            by_clock = wanted.seconds or wanted.until_error
+            sizes = budget.pass_sizes(scene) if by_clock else sorted(set(budget.plan_passes(scene, self.n)))
+            if wanted.seconds is None and not hasattr(integrator, "prepare"):
+                sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
+            self.case.seconds_compile = budget.warm_up(scene, integrator, sizes, wanted.seed)
+        else:
+            cluster.check(self.case)
+        if wanted.load_cache is not None:
+            integrator.load_cache(str(wanted.load_cache))
+
+    def train(self, bars: terminal.Bars) -> bool:
+        """Train what is trained before the first sample. Returns whether that was interrupted."""
+        wanted, (scene, integrator) = self.wanted, self.subject
+        bar = bars(f"training {wanted.pretrain} frames") if wanted.pretrain else None
+        self.seconds_pretrain, stopped = budget.train(scene, integrator, wanted.pretrain, progress=bar)
+        if (wanted.seconds is None or wanted.until_error) and not stopped:
+            bar = self.previewed(bars("training")) if hasattr(integrator, "train_first") else None
+            self.seconds_first, stopped = budget.train_first(scene, integrator, progress=bar)
+        return stopped
+
+    def render(self, bars: terminal.Bars, workers, stopped: bool) -> budget.Rendered:
+        """Render to the number of samples, the seconds or the error; one sample at once if training was `stopped`."""
+        wanted, (scene, integrator) = self.wanted, self.subject
+        if stopped:  # the image that is there at once
+            rendered = budget.render_samples(scene, integrator, 1, wanted.seed)
+            rendered.interrupted = True
+        elif wanted.until_error is not None:
+            bar = bars(f"rendering until the error is {wanted.until_error:g}")
+            # Training counts
+            left = None if wanted.seconds is None else max(wanted.seconds - self.seconds_first, 0.0)
+            rendered, self.estimate = budget.render_until(
+                scene, integrator, wanted.until_error, left, wanted.seed, progress=bar, keep=self.keep
+            )
+        elif wanted.seconds is not None:
+            bar = bars(f"rendering for {wanted.seconds:g} s")
+            rendered = budget.render_seconds(
+                scene, integrator, wanted.seconds, wanted.seed, progress=bar,
+                pretrained=bool(wanted.pretrain or wanted.load_cache), keep=self.keep,
+            )  # fmt: skip
+        elif workers is not None:
+            setup = jobs.Setup.of(self.loaded, self.case, wanted.size, own=wanted.spec is None)
+            bar = bars(f"rendering {self.n} samples a pixel on {terminal.counted(workers.count(), 'worker')}")
+            rendered = cluster.render_samples(
+                setup, self.loaded, self.case, self.n, wanted.seed, workers, progress=bar, keep=self.keep
+            )
+        else:
+            bar = bars(f"rendering {self.n} samples a pixel")
+            rendered = budget.render_samples(scene, integrator, self.n, wanted.seed, progress=bar, keep=self.keep)
+        rendered.seconds_train += self.seconds_first - self.seconds_preview
+        return rendered
+
+    def denoised(self, rendered: budget.Rendered) -> tuple:
+        """(The image to write, seconds of the denoiser)."""
+        return denoise.denoise(rendered.rgb, self.guides) if self.wanted.denoise else (rendered.rgb, 0.0)
+
+    def write(self, rendered: budget.Rendered, image, seconds_denoise: float, ref) -> None:
+        """Write the image, its facts and the cache, and say what was written."""
+        wanted = self.wanted
+        row = self.describe(rendered, image, seconds_denoise)
+        terminal.write_image(wanted.output, row, image, rendered)
+        if ref is not None:
+            benchmark.judge(row, [image], ref)
+            terminal.write_image(wanted.output, row, image, rendered)  # again, with the errors among its facts
+        if wanted.json is not None:
+            exr.write_text(wanted.json, json.dumps(row.to_json(), indent=1) + "\n")
+        if wanted.save_cache is not None:
+            self.case.integrator.save_cache(str(wanted.save_cache))
+        terminal.print_rows(repeats.group([row]))
+        first = f"first image {row.seconds_to_first_image:.1f} s after the start"
+        terminal.out.print(f"wrote {wanted.output}; {first}", soft_wrap=True, markup=False)
+        if (estimate := self.estimate) is not None:
+            terminal.out.print(
+                f"estimated trimmed relMSE {estimate.value:.3g} ({100 * moments.CONFIDENCE:.0f} % interval "
+                f"{estimate.low:.3g} to {estimate.high:.3g}), of the noise alone, at {rendered.spp} samples a pixel",
+                soft_wrap=True, markup=False,
+            )  # fmt: skip
+
+    def describe(self, rendered: budget.Rendered, image, seconds_denoise: float = 0.0) -> benchmark.Row:
+        """The facts of an image."""
+        wanted = self.wanted
         row = benchmark.make_row(
-            loaded, case, "one-shot" if seconds is not None else "spp", [rendered], [image], seed,
-            denoised=denoise_ and image is not rendered.rgb, seconds_denoise=seconds_denoise,
-            environment=environment.describe(), budget_seconds=seconds, pretrain_frames=pretrain,
-            seconds_pretrain=seconds_pretrain,
+            self.loaded, self.case, "one-shot" if wanted.seconds is not None else "spp", [rendered], [image],
+            wanted.seed, denoised=wanted.denoise and image is not rendered.rgb, seconds_denoise=seconds_denoise,
+            environment=environment.describe(), budget_seconds=wanted.seconds, pretrain_frames=wanted.pretrain,
+            seconds_pretrain=self.seconds_pretrain,
         )  # fmt: skip
-        row.image, row.seconds_to_first_image = str(output), first_image or environment.seconds_since_start()
+        row.image = str(wanted.output)
+        row.seconds_to_first_image = self.first_image or environment.seconds_since_start()
         return row
 
-    def keep(so_far: budget.Rendered) -> None:
-        nonlocal first_image
-        terminal.write_image(output, describe(so_far, so_far.rgb), so_far.rgb, so_far)
-        first_image = first_image or environment.seconds_since_start()
+    def keep(self, so_far: budget.Rendered) -> None:
+        """Write the image so far."""
+        terminal.write_image(self.wanted.output, self.describe(so_far, so_far.rgb), so_far.rgb, so_far)
+        self.first_image = self.first_image or environment.seconds_since_start()
 
-    def previewed(progress: budget.Progress) -> budget.Progress:
+    def previewed(self, progress: budget.Progress) -> budget.Progress:
         """`progress` of training, which also writes a first image after some time of it."""
         start = budget.clock()
 
         def advance(done: float, total: float) -> None:
-            nonlocal seconds_preview
             progress(done, total)
             now = budget.clock()
-            if first_image is not None or done >= total or now - start < PREVIEW_SECONDS:
+            if self.first_image is not None or done >= total or now - start < PREVIEW_SECONDS:
                 return
-            if (so_far := budget.preview(loaded.scene, case.integrator, seed)) is not None:
-                keep(so_far)
-            seconds_preview += budget.clock() - now
+            if (so_far := budget.preview(*self.subject, self.wanted.seed)) is not None:
+                self.keep(so_far)
+            self.seconds_preview += budget.clock() - now
 
         return advance
-
-    with terminal.Bars() as bars, connect(scheduler) as workers:
-        if denoise_:
-            bars("guides for the denoiser")
-            guides, _ = denoise.render_guides(loaded.scene, seed)
-            denoise.warm_up(guides)
-        n = spp or loaded.default_spp
-        if workers is None:
-            bars("compiling")
-            by_clock = seconds or until_error
-            sizes = budget.pass_sizes(loaded.scene) if by_clock else sorted(set(budget.plan_passes(loaded.scene, n)))
-            if seconds is None and not hasattr(case.integrator, "prepare"):
-                sizes = sizes[:1]  # Mitsuba's kernels are the same for every number of samples
-            case.seconds_compile = budget.warm_up(loaded.scene, case.integrator, sizes, seed)
-        else:
-            cluster.check(case)
-        if load_cache is not None:
-            case.integrator.load_cache(str(load_cache))
-        bars_pretrain = bars(f"training {pretrain} frames") if pretrain else None
-        seconds_pretrain, stopped = budget.train(loaded.scene, case.integrator, pretrain, progress=bars_pretrain)
-        seconds_first = 0.0
-        if (seconds is None or until_error) and not stopped:
-            bars_first = previewed(bars("training")) if hasattr(case.integrator, "train_first") else None
-            seconds_first, stopped = budget.train_first(loaded.scene, case.integrator, progress=bars_first)
-        if stopped:  # the image that is there at once
-            rendered = budget.render_samples(loaded.scene, case.integrator, 1, seed)
-            rendered.interrupted = True
-        elif until_error is not None:
-            bar = bars(f"rendering until the error is {until_error:g}")
-            left = None if seconds is None else max(seconds - seconds_first, 0.0)  # training counts
-            rendered, estimate = budget.render_until(
-                loaded.scene, case.integrator, until_error, left, seed, progress=bar, keep=keep
-            )
-        elif seconds is not None:
-            rendered = budget.render_seconds(
-                loaded.scene,
-                case.integrator,
-                seconds,
-                seed,
-                progress=bars(f"rendering for {seconds:g} s"),
-                pretrained=bool(pretrain or load_cache),
-                keep=keep,
-            )
-        elif workers is not None:
-            setup = jobs.Setup.of(loaded, case, wanted_size, own=spec is None)
-            bar = bars(f"rendering {n} samples a pixel on {terminal.counted(workers.count(), 'worker')}")
-            rendered = cluster.render_samples(setup, loaded, case, n, seed, workers, progress=bar, keep=keep)
-        else:
-            rendered = budget.render_samples(
-                loaded.scene, case.integrator, n, seed, progress=bars(f"rendering {n} samples a pixel"), keep=keep
-            )
-        rendered.seconds_train += seconds_first - seconds_preview
-        image, seconds_denoise = rendered.rgb, 0.0
-        if denoise_:
-            image, seconds_denoise = denoise.denoise(rendered.rgb, guides)
-
-    row = describe(rendered, image, seconds_denoise)
-    terminal.write_image(output, row, image, rendered)
-    if ref is not None:
-        benchmark.judge(row, [image], ref)
-        terminal.write_image(output, row, image, rendered)  # again, with the errors among its facts
-    if json_ is not None:
-        exr.write_text(json_, json.dumps(row.to_json(), indent=1) + "\n")
-    if save_cache is not None:
-        case.integrator.save_cache(str(save_cache))
-    terminal.print_rows(repeats.group([row]))
-    first = f"first image {row.seconds_to_first_image:.1f} s after the start"
-    terminal.out.print(f"wrote {output}; {first}", soft_wrap=True, markup=False)
-    if estimate is not None:
-        terminal.out.print(
-            f"estimated trimmed relMSE {estimate.value:.3g} ({100 * moments.CONFIDENCE:.0f} % interval "
-            f"{estimate.low:.3g} to {estimate.high:.3g}), of the noise alone, at {rendered.spp} samples a pixel",
-            soft_wrap=True, markup=False,
-        )  # fmt: skip
-    if rendered.problem:
-        raise InputError(f"{rendered.problem}; the image has {rendered.spp} of {n} samples a pixel")
-    if rendered.interrupted:
-        raise KeyboardInterrupt(f"interrupted: the image has {rendered.spp} samples a pixel")

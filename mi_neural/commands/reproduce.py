@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from mi_neural.bench import environment, terminal
+from mi_neural.bench.load import InputError
 from mi_neural.commands import options
 from mi_neural.reproduce import page, registry
 from mi_neural.reproduce.work import Work
@@ -18,6 +19,7 @@ from mi_neural.reproduce.work import Work
 
 @options.readable
 def reproduce(
+    context: typer.Context,
     name: Annotated[
         list[str] | None, typer.Argument(metavar="NAME", help="entries, or the name of a source for all of its entries")
     ] = None,
@@ -36,6 +38,9 @@ def reproduce(
     Delete DIR/measured to measure anew.
     """
     if not name:
+        if given := options.given(context):
+            raise InputError(f"{given[0]} is for an entry: mi-neural reproduce NAME {given[0]} ...; without options "
+                             "mi-neural reproduce lists them")  # fmt: skip
         _print_left(listing())
         terminal.out.print("mi-neural reproduce NAME [--quick] renders one; the name of a source, all of it",
                            soft_wrap=True)  # fmt: skip

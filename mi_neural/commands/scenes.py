@@ -62,7 +62,7 @@ def show(text: str) -> None:
     terminal.out.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-@scenes.command()
+@scenes.command(cls=options.Command)
 @options.readable
 def get(
     name: Annotated[list[str], typer.Argument(metavar="NAME", help="public scenes")],
@@ -93,7 +93,7 @@ def get(
         show(f"'{scene.title}' by {scene.author}; {scene.licence}")
 
 
-@scenes.command()
+@scenes.command(cls=options.Command)
 @options.readable
 def check(
     name: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="public scenes; default: all here")] = None,

@@ -14,6 +14,7 @@ from mi_neural.bench.reference import load_reference
 from mi_neural.explore import controls
 from mi_neural.image import exr, metrics
 from mi_neural.image.moments import Accumulator
+from mi_neural.render.film import sensor_of
 
 
 class Session:
@@ -35,6 +36,7 @@ class Session:
     def __init__(self, scene, integrator=None, sensor: int = 0, reference=None, spp: int = 1, seed: int = 0) -> None:
         if spp < 1:
             raise ValueError(f"spp is {spp}; it must be at least 1")
+        sensor_of(scene, sensor, "live")
         self.scene, self.sensor, self.spp, self.seed = scene, sensor, spp, seed
         self.integrator = _integrator(scene, integrator)
         self.camera = controls.Camera(scene, sensor)

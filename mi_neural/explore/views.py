@@ -13,6 +13,7 @@ import numpy as np
 from mi_neural.caches.blend import Blend
 from mi_neural.caches.outgoing_field import OutgoingField
 from mi_neural.render import vertex
+from mi_neural.render.film import sensor_of
 from mi_neural.render.sampling import PathSampler
 from mi_neural.render.surface import scene_is_glossy, surface_of
 
@@ -39,7 +40,7 @@ class Hemisphere:
         self.scene, self.integrator, self.size = scene, integrator, size
         self.path = mi.load_dict({"type": "path", "max_depth": max_depth})
         self.pixel = pixel
-        camera = scene.sensors()[sensor]
+        camera = sensor_of(scene, sensor, "the view")
         width, height = (int(n) for n in camera.film().crop_size())
         if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
             raise ValueError(f"pixel {pixel} lies outside of the picture of {width}x{height}")
@@ -207,7 +208,7 @@ def _lights(integrator):
 
 def _first_surfaces(scene, sensor: int):
     """What each pixel's centre shows, and the shape (height, width)."""
-    camera = scene.sensors()[sensor]
+    camera = sensor_of(scene, sensor, "the view")
     width, height = (int(n) for n in camera.film().crop_size())
     lane = dr.arange(mi.UInt32, width * height)
     return _seen(scene, camera, mi.Float(lane % width) + 0.5, mi.Float(lane // width) + 0.5), (height, width)

@@ -82,6 +82,22 @@ def camera_rays(sensor, area: Area, pixel, sampler) -> tuple:
     return ray, weight, place, sampler
 
 
+def sensor_of(scene, sensor, who: str):
+    """The sensor of that number, or the sensor given. Raises ValueError, beginning with `who`, where there is none."""
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    if not hasattr(sensor, "__index__"):
+        raise ValueError(f"{who}: sensor is {sensor!r}; give its number in the scene, or a sensor")
+    if not scene.sensors():
+        raise ValueError(
+            f"{who}: the scene has no sensor; add one, for example <sensor type=\"perspective\"/>, or give one to "
+            "mi.render(scene, sensor=...)"
+        )
+    if not 0 <= sensor < len(scene.sensors()):
+        raise ValueError(f"{who}: there is no sensor {sensor}; the scene has {len(scene.sensors())}")
+    return scene.sensors()[sensor]
+
+
 def film_rays(sensor, place, sampler) -> mi.Ray3f:
     """Rays through `place`, in [0, 1]² of the film; time and aperture are drawn from `sampler`."""
     time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
@@ -165,7 +181,8 @@ class Samples:
     """Which camera samples a pass renders; numbers as variables, so that one kernel serves all sizes. A PyTree.
 
     `seed` is that of the independent random numbers, `sequence` that of the stratified ones: passes of one image that
-    have it in common go on where the one before ended, at `first_sample`.
+    have it in common go on where the one before ended, at `first_sample`. `n_image`: samples a pixel of the image, of
+    which this pass has `n_samples`.
     """
 
     seed: mi.UInt32
@@ -174,6 +191,7 @@ class Samples:
     n_samples: mi.UInt32
     first_row: mi.UInt32
     n_rows: mi.UInt32
+    n_image: mi.UInt32
 
     def lanes(self, area: Area, n_lanes: int) -> tuple:
         """(pixel, number of the sample in its pixel, active) for each lane.
@@ -187,6 +205,10 @@ class Samples:
         local = packet // self.n_samples * PACKET + lane % PACKET
         return (local + self.first_row * area.width, packet % self.n_samples + self.first_sample,
                 local < area.width * self.n_rows)  # fmt: skip
+
+    def scale_differentials(self, ray) -> None:
+        """Make the differentials of camera rays as narrow as the image's samples of a pixel lie, as Mitsuba does."""
+        ray.scale_differential(dr.rsqrt(mi.Float(self.n_image)))
 
     def sampler(self, pixel, sample, salt: int) -> PathSampler:
         """Random numbers of these samples; another `salt` gives other independent ones, the same stratified ones."""
@@ -268,7 +290,7 @@ def _pass_of(estimate, channels: dict[str, int], area: Area, alpha: bool, n_pixe
             ray, weight, place, sampler = camera_rays(sensor, area, pixel, sampler)
         else:
             ray, weight, place = rays
-        ray.scale_differential(dr.rsqrt(mi.Float(samples.n_samples)))
+        samples.scale_differentials(ray)
 
         L, valid, extra = estimate(scene, lights, field, sampler, ray, settings, active)
         L = L * weight if special is not None else film_colour(L * weight, ray.wavelengths, active)
