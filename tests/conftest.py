@@ -90,7 +90,7 @@ def _same_start_for_every_test(_kept):
     # Scenes and integrators refer to each other in circles. Those of old tests would be compiled into the calls of the
     # next ones, being in Dr.Jit's registry, and be freed at any moment of them.
     gc.collect()
-    if _released:
+    if _released:  # to look through the libraries, too, would take half a second after each of the module's tests
         gc.freeze()
         _released.clear()
         _kept.append(True)
