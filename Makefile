@@ -7,7 +7,7 @@ STAMP  := $(VENV)/mi_neural.stamp
 TESTS  := $(VENV)/tests.stamp
 
 .DEFAULT_GOAL := help
-.PHONY: help demo picture bench gallery gallery-pictures docs tables results gpu notebooks test test-notebooks stress lint clean
+.PHONY: help demo picture bench gallery gallery-pictures docs tables results gpu notebooks test test-all test-notebooks stress lint clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -86,6 +86,9 @@ results: $(STAMP)  ## measure tables again, those that a command makes (ONLY=NAM
 # Of xdist's ways to share the work, worksteal is one that goes on when a process ends; loadfile waits for ever.
 test: $(TESTS)  ## the default tests, a few minutes on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-all: $(TESTS)  ## the default tests and the slow ones, tens of minutes
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not notebooks and not peer" -o faulthandler_timeout=0
 
 test-notebooks: $(TESTS)  ## every notebook, shortened, two minutes
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m notebooks tests/test_notebooks.py

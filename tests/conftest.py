@@ -45,6 +45,16 @@ def set_variant(*names, before=mitsuba.set_variant):
 mitsuba.set_variant = set_variant
 """
 gc.disable()  # while test modules are imported: what they define stays
+_unfreeze, _released = gc.unfreeze, []
+
+
+def _unfrozen() -> None:
+    """`mi.render`, after a function that a test froze, releases all that was kept."""
+    _unfreeze()
+    _released.append(True)
+
+
+gc.unfreeze = _unfrozen
 
 
 def pytest_collection_finish():
@@ -59,13 +69,18 @@ def _keep_what_is_there():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _what_earlier_modules_imported_stays():
-    # Their fixtures are gone by now, and what remains are libraries: to look through them takes 30 ms after every test
+def _kept():
+    # Fixtures of earlier modules are gone by now, and what remains are libraries: to look through them takes 30 ms and
+    # more after every test
     _keep_what_is_there()
+    kept_again = []
+    yield kept_again
+    if kept_again:
+        _unfreeze()  # this module's fixtures were among it
 
 
 @pytest.fixture(autouse=True)
-def _same_start_for_every_test():
+def _same_start_for_every_test(_kept):
     quick_kernels.let_others_work()  # a test may have started new ones
     mi.set_variant(VARIANT)
     random.seed(0)
@@ -75,6 +90,10 @@ def _same_start_for_every_test():
     # Scenes and integrators refer to each other in circles. Those of old tests would be compiled into the calls of the
     # next ones, being in Dr.Jit's registry, and be freed at any moment of them.
     gc.collect()
+    if _released:  # to look through the libraries, too, would take half a second after each of the module's tests
+        gc.freeze()
+        _released.clear()
+        _kept.append(True)
 
 
 @pytest.fixture

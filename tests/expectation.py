@@ -12,27 +12,29 @@ ERROR_RATE = 1e-4
 MITSUBAS = ("path", "volpath", "volpathmis")
 
 
-def renders(scene, integrator, n: int, spp: int, first_seed: int = 0) -> np.ndarray:
+def renders(scene, integrator, n: int, spp: int, first_seed: int = 0, sensor=0, channels=slice(3)) -> np.ndarray:
     """`n` independent images, shape (n, height, width, 3). `integrator`: a dictionary or an integrator."""
     if isinstance(integrator, dict):
         kind, integrator = integrator["type"], mi.load_dict(integrator)
         if kind in MITSUBAS and mi.variant().endswith("_rgb"):
             try:
-                return _recorded(scene, integrator, n, spp, first_seed)
+                return _recorded(scene, integrator, n, spp, first_seed, sensor)[..., channels]
             except RuntimeError as error:
                 if "recording" not in str(error):  # some scenes cannot be recorded: "a virtual function call"
                     raise
-    images = [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=first_seed + k)) for k in range(n)]
-    return np.stack(images).astype(np.float64)[..., :3]
+    images = [np.array(mi.render(scene, integrator=integrator, sensor=sensor, spp=spp, seed=first_seed + k))
+              for k in range(n)]  # fmt: skip
+    return np.stack(images).astype(np.float64)[..., channels]
 
 
-def _recorded(scene, integrator, n: int, spp: int, first_seed: int) -> np.ndarray:
+def _recorded(scene, integrator, n: int, spp: int, first_seed: int, sensor) -> np.ndarray:
     """The same images. Ours record themselves; Mitsuba's are traced anew for every image, which takes 20 ms. In mono
     and spectral variants they cannot be recorded: "a virtual function call involving variable"."""
-    frame = dr.freeze(lambda scene, integrator, seed: integrator.render(scene, seed=seed, spp=spp))
+    sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+    frame = dr.freeze(lambda scene, integrator, sensor, seed: integrator.render(scene, sensor, seed, spp))
     with undisturbed():
-        images = [np.array(frame(scene, integrator, mi.UInt32(first_seed + k))) for k in range(n)]
-    return np.stack(images).astype(np.float64)[..., :3]
+        images = [np.array(frame(scene, integrator, sensor, mi.UInt32(first_seed + k))) for k in range(n)]
+    return np.stack(images).astype(np.float64)
 
 
 def assert_mean(samples, known, what: str = "", relative: float = 1e-6) -> None:

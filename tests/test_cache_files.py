@@ -147,6 +147,12 @@ def saved(cube, tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def loading():
+    """What loads the files. One for all of them, as it is recorded once."""
+    return small_nirc()
+
+
 @pytest.mark.parametrize("change", [
     lambda h, a: h.pop("training"), lambda h, a: h["training"].update(rate_factor=0),
     lambda h, a: h["training"].update(history="long"), lambda h, a: h["training"].update(levels=[None]),
@@ -156,12 +162,13 @@ def saved(cube, tmp_path_factory):
     lambda h, a: h["shape"].update(hashmap_size=2**40), lambda h, a: h["shape"].update(width=10**6),
     lambda h, a: a.update(beside=np.zeros(1)),
 ])  # fmt: skip
-def test_damaged_state_is_refused_and_nothing_is_half_loaded(cube, saved, tmp_path, change):
+def test_damaged_state_is_refused_and_nothing_is_half_loaded(cube, saved, loading, tmp_path, change):
     scene, _ = cube
     header, arrays = files.read(saved, "incident")
     change(header, arrays)
     files.write(tmp_path / "b.npz", "incident", header, arrays)
-    new = small_nirc()
+    new = loading
+    new.reset()
     new.train(scene, 1)
     field = new.cache.field
     with pytest.raises(CacheFileError, match=r"b\.npz"):

@@ -5,6 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, sweep
 from expectation import assert_mean, assert_same_mean, renders
 from media_scenes import ball, cube, everywhere, fog, lamp, rgb, room, smoke, wall
 
@@ -50,8 +51,10 @@ def compare(what: str, scene, reference: np.ndarray, keys: dict) -> None:
     assert_same_mean(renders(scene, keys, 16, 128), reference, what, blocks=2, relative=1e-4, tests=N_TESTS)
 
 
-@pytest.mark.parametrize("kind", NAMES)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name, kind", sweep(
+    [(name, kind) for name in SCENES for kind in NAMES],
+    [("heterogeneous", "nrc"), ("heterogeneous", "neural_path"), ("half open walls", "nrc"), ("in rough glass", "nrc")],
+))  # fmt: skip
 def test_paths_without_end_show_the_image_of_volpath(name, kind, known):
     make, reference = SCENES[name]
     scene = make()
@@ -65,8 +68,9 @@ def test_lights_are_chosen_by_a_light_sampler(known):
     compare("nvc", scene, images, {"type": "nrc", "light_sampler": sampler, **TRACED})
 
 
-@pytest.mark.parametrize("kind", NAMES)
-@pytest.mark.parametrize("limits", LIMITS)
+@pytest.mark.parametrize("limits, kind", sweep(
+    [(limits, kind) for limits in LIMITS for kind in NAMES], [(LIMITS[1], "nrc"), (LIMITS[2], "neural_path")]
+))  # fmt: skip
 def test_depths_roulette_and_hidden_emitters_are_those_of_volpath(limits, kind, known):
     scene = room(box=cube(fog(1.5, 0.9)), seen=lamp((0, 0.2, -0.8), rgb(1.0, 2.0, 3.0), 0.2),
                  sky={"type": "constant", "radiance": 0.2})  # fmt: skip
@@ -194,13 +198,14 @@ def test_twins_start_at_one_point_and_go_their_own_ways():
     assert both.sum() > 500 and (np.abs(second[::2] - second[1::2]).max(axis=1)[both] > 0).all()
 
 
-@pytest.mark.parametrize("kind", NAMES)
-@pytest.mark.parametrize("albedo", [1.0, 0.8])
+@pytest.mark.parametrize("albedo, kind", sweep(
+    [(albedo, kind) for albedo in (1.0, 0.8) for kind in NAMES], [(1.0, "nrc"), (0.8, "neural_path")]
+))  # fmt: skip
 def test_cloud_seen_in_the_cache(kind, albedo):
     """The cache alone, at the first vertex: 1 everywhere where the albedo is 1, else the image of `volpath`."""
     scene = cloud(albedo)
     integrator = mi.load_dict({"type": kind, "spread_threshold": 0.0, "train_frames": 96, "train_steps": 0,
-                               "train_samples": 1024, "channels": "cache, cached, traced"})  # fmt: skip
+                               "train_samples": 1024, "channels": "cache, cached, traced", **NETWORK})  # fmt: skip
     images = np.array([mi.render(scene, integrator=integrator, spp=64, seed=k) for k in range(2)], np.float64)
     middle = np.s_[:, 3:5, 3:5]
     expected = 1.0 if albedo == 1 else renders(scene, {"type": "volpath"}, 4, 256)[middle].mean()
@@ -292,7 +297,7 @@ def two_rooms() -> mi.Scene:
     return mi.load_dict({"type": "scene", **parts})
 
 
-@pytest.mark.parametrize("kind", NAMES)
+@pytest.mark.parametrize("kind", sweep(NAMES, ("nrc",)))
 def test_what_leaves_the_view_is_not_forgotten(kind):
     """Trained in one foggy room, then in the other: with places out of view the cache's answers in the first, at
     points of the fog and on its walls, stay what they were. When the camera stays, they change by 0.09."""
@@ -319,10 +324,10 @@ def test_what_leaves_the_view_is_not_forgotten(kind):
 # ---------------------------------------------------------------- edits, recordings, refusals
 
 
-@pytest.mark.parametrize("kind", NAMES)
+@pytest.mark.parametrize("kind", sweep(NAMES, ("neural_path",)))
 def test_another_medium_another_camera_and_a_scene_without_media(kind):
     """Recorded functions know of each; images of one kind are recorded once."""
-    keys = {"type": kind, "train_frames": 8, "train_samples": 256, "max_depth": 6}
+    keys = {"type": kind, "train_frames": 8, "train_samples": 256, "max_depth": 6, **NETWORK}
     integrator = mi.load_dict(keys)
 
     def mean(scene, n=3):
@@ -352,7 +357,7 @@ def test_what_is_refused_in_media(kind):
     for _ in range(2):  # the second time, too
         with pytest.raises(ValueError, match="roughening works in scenes without participating media; leave it out"):
             refused.render(scene, spp=1)
-    integrator, params = mi.load_dict({"type": kind, "train_frames": 1}), mi.traverse(scene)
+    integrator, params = mi.load_dict({"type": kind, "train_frames": 1, **NETWORK}), mi.traverse(scene)
     key = "floor.bsdf.reflectance.value"
     dr.enable_grad(params[key])
     params.update()

@@ -201,7 +201,7 @@ def test_passes_are_those_of_one_process_where_it_has_many(monkeypatch):
 # ---------------------------------------------------------------- two workers
 
 
-@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_image_of_two_workers_is_that_of_one_process_although_some_are_killed(address, n):
     """The same passes with the same numbers: equal up to the order of summation."""
     before, victims = pids(address), []

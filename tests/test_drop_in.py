@@ -4,7 +4,10 @@ Mitsuba's `path` is the reference. Comparisons of means allow for four standard 
 for 8 % of bias: a false alarm in about 10,000 choices of seed.
 """
 
+import contextlib
 import gc
+import io
+import itertools
 import math
 import re
 import resource
@@ -14,11 +17,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW, sweep
 
 from mi_neural.render.film import Area, put_in_reach
 
 T = mi.ScalarTransform4f
-SMALL = {"train_frames": 32, "train_samples": 512}
+SMALL = {"train_frames": 32, "train_samples": 512, **NETWORK}
 INTEGRATORS = {
     "plain_path": {"type": "plain_path"},
     "nirc": {"type": "nirc", **SMALL},
@@ -29,6 +33,8 @@ INTEGRATORS = {
 UNBIASED = ("plain_path", "nirc_two_level")
 CACHED = tuple(n for n in INTEGRATORS if n != "plain_path")
 ALL = pytest.mark.parametrize("name", INTEGRATORS)
+#: For tests of what all integrators inherit: one without a cache and one with.
+TWO = pytest.mark.parametrize("name", sweep(INTEGRATORS, ("plain_path", "nrc")))
 
 
 def grey(value):
@@ -83,7 +89,7 @@ def agree(name, ours, path, channels=slice(0, 3)):
 # ---------------------------------------------------------------- sensors
 
 
-@ALL
+@TWO
 def test_sensor_that_is_not_in_the_scene(name):
     scene, integrator = room(sensor=None), mi.load_dict(INTEGRATORS[name])
     for x in (-1.0, 1.0):
@@ -103,7 +109,7 @@ def test_sensors_that_cannot_be_recorded_render_from_recorded_functions(name, ki
 
 
 @pytest.mark.parametrize("name", ["plain_path", "nirc"])
-def test_batch_and_irradiance_meter(name):
+def test_irradiance_meter(name):
     def meter(x, count):  # equal sensors would be merged into one by Mitsuba 3.9.1
         sensor = {"type": "irradiancemeter", "film": film(1, 1),
                   "sampler": {"type": "independent", "sample_count": count}}  # fmt: skip
@@ -116,6 +122,10 @@ def test_batch_and_irradiance_meter(name):
         assert "chosen uniformly" in made.decisions["light_sampler"].because
     for k in range(2):
         agree(name, images(scene, INTEGRATORS[name], k, 4096), images(scene, {"type": "path"}, k, 4096, first=100))
+
+
+@pytest.mark.parametrize("name", ["plain_path", pytest.param("nirc", marks=SLOW)])
+def test_batch(name):
     view = {k: v for k, v in camera().items() if k != "film"}
     scene = room(sensor={"type": "batch", "a": view, "b": {**view, "fov": 20}, "film": film(24, 12)})
     agree(name, images(scene, INTEGRATORS[name]), images(scene, {"type": "path"}, first=100))
@@ -202,9 +212,10 @@ def of_path():
     return rendered
 
 
-@pytest.mark.parametrize("hide", [False, True])
-@pytest.mark.parametrize("case", COVERAGE)
-@ALL
+@pytest.mark.parametrize("name, case, hide", sweep(
+    itertools.product(INTEGRATORS, COVERAGE, (False, True)),
+    [*itertools.product(["plain_path"], COVERAGE, (False, True)), ("nirc", "thirds", True), ("nrc", "thirds", True)],
+))  # fmt: skip
 def test_coverage_is_that_of_path(name, case, hide, of_path):
     parts, n = COVERAGE[case]
     scene = room(sensor=camera(film=film(12 * n, pixel_format="rgba"), fov_axis="y"), **parts)
@@ -217,7 +228,7 @@ def test_coverage_is_that_of_path(name, case, hide, of_path):
         assert np.abs(a - b).max() < 0.22 and abs(a.mean() - b.mean()) < 0.02
 
 
-@pytest.mark.parametrize("name", CACHED)
+@pytest.mark.parametrize("name", sweep(CACHED, ("nirc", "nrc")))
 def test_mirror_behind_a_hidden_lamp(name):
     mirror = wall((0, 0, -0.95), size=0.6, bsdf={"type": "twosided", "bsdf": {"type": "conductor"}})
     ball = {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.2, "emitter": {"type": "area", "radiance": 3.0}}
@@ -240,7 +251,7 @@ def test_roulette_begins_where_it_does_in_path(name):
 # ---------------------------------------------------------------- wrappers
 
 
-@pytest.mark.parametrize("name", ["nirc", "nrc"])
+@pytest.mark.parametrize("name", [pytest.param("nirc", marks=SLOW), "nrc"])
 def test_wrappers_train_for_the_sensor_that_renders(name):
     """Two rooms, the first sensor in the other one: a cache trained there knows nothing of this one."""
     def rooms(x, tint, n):
@@ -266,7 +277,7 @@ def test_wrappers_train_for_the_sensor_that_renders(name):
 # ---------------------------------------------------------------- loops, threads, the user's own recordings
 
 
-@ALL
+@TWO
 def test_function_of_the_users_own_may_be_frozen_around_a_trained_integrator(name):
     scene = room()
     integrator = mi.load_dict({**INTEGRATORS[name], **({} if name == "plain_path" else {"train_steps": 0})})
@@ -284,9 +295,10 @@ def test_function_of_the_users_own_may_be_frozen_around_a_trained_integrator(nam
     assert abs(frozen.mean() / plain.mean() - 1) < 0.03
 
 
-def test_light_sampler_inside_a_function_of_the_users_own_says_why_not(run_python):
+@pytest.mark.parametrize("integrators", [("plain_path",), pytest.param(("nirc",), marks=SLOW)])
+def test_light_sampler_inside_a_function_of_the_users_own_says_why_not(run_python, integrators):
     """A replay would choose among the lights of the first call; in a process of its own, as it ended the process."""
-    samplers, integrators = ("uniform_lights", "power_lights", "tree_lights", "nvc_lights"), ("plain_path", "nirc")
+    samplers = ("uniform_lights", "power_lights", "tree_lights", "nvc_lights")
     code = f"""
 import mi_neural, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
@@ -350,10 +362,11 @@ print(f"{inside} inside, {outside} outside")
     assert re.fullmatch(r"0 inside, [1-9]\d* outside\n", out), out
 
 
-def test_scenes_loaded_in_a_loop_leave_nothing_behind():
-    """200 scenes, sensors and integrators; memory after the first 40 is that at the end, to 3 %."""
+@pytest.mark.parametrize("n", [60, pytest.param(200, marks=SLOW)])
+def test_scenes_loaded_in_a_loop_leave_nothing_behind(n):
+    """Scenes, sensors and integrators; memory after the first 40 is that at the end, to 3 %."""
     sizes = []
-    for k in range(200):
+    for k in range(n):
         scene, view = room(sensor=None), mi.load_dict(camera())
         keys = {"train_frames": 1, "train_samples": 64, "levels": 2} if k % 4 == 0 else None
         integrator = mi.load_dict({"type": "nrc", **keys} if keys else {"type": "plain_path"})
@@ -397,7 +410,9 @@ def test_same_seed_gives_the_same_image_in_another_process(run_python):
             integrator = mi.load_dict({**keys, "levels": 4, "width": 16, "train_frames": 4, "train_samples": 128})
             print(*np.array(mi.render(scene, integrator=integrator, spp=4, seed=3)).ravel())
     """
-    a, b = (np.array(run_python(code, quick=True).stdout.split(), float) for _ in range(2))
+    with contextlib.redirect_stdout(io.StringIO()) as here:
+        exec(code)
+    a, b = (np.array(text.split(), float) for text in (here.getvalue(), run_python(code, quick=True).stdout))
     np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK
 
 from mi_neural import scenes
 from mi_neural.manual import pages
@@ -28,7 +29,7 @@ def shortened(keys: dict) -> dict:
     """The dictionary of a plugin, with so little training that a test can wait for it."""
     keys = {k: shortened(v) if isinstance(v, dict) else v for k, v in keys.items()}
     if keys.get("type") in CACHED:
-        return {"train_frames": 2, "train_samples": 64, **keys}
+        return {"train_frames": 2, "train_samples": 64, **NETWORK, **keys}
     return keys | {"width": 16, "height": 16} if keys.get("type") == "hdrfilm" else keys
 
 

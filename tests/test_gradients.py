@@ -9,11 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, sweep
 
 from mi_neural import scenes
 
 T = mi.ScalarTransform4f
-SMALL = {"train_frames": 96, "train_samples": 1024}
+SMALL = {"train_frames": 96, "train_samples": 1024, **NETWORK}
 CACHED = ("nirc", "nrc", "neural_path", "nirc_two_level")
 BY_CACHE = ("nirc", "nrc", "neural_path")
 
@@ -118,7 +119,7 @@ def test_gradients_of_the_point_lit_sphere(name, keys):
     """Albedo ρ, intensity I: L = I/π ρ/(1 - ρ) everywhere, so dL/dρ = 4 and dL/dI = 1/π at 1/2 and π."""
     scene = mi.load_file(str(scenes.path("point_lit_sphere")), resx=8, resy=8)
     params, (wall_key, light_key) = tracked(scene)
-    integrator = mi.load_dict({"type": name, "train_frames": 48, "train_samples": 512, **keys})
+    integrator = mi.load_dict({"type": name, "train_frames": 48, "train_samples": 512, **NETWORK, **keys})
     image = mi.render(scene, params, integrator=integrator, spp=64, seed=1)
     steps = integrator.cache.steps
     dr.backward(dr.mean(image, axis=None))
@@ -131,7 +132,7 @@ def test_gradients_of_the_point_lit_sphere(name, keys):
     assert integrator.cache.steps == steps + 1, "the next image does"
 
 
-@pytest.mark.parametrize("keys", [{}, {"light_sampler": {"type": "uniform_lights"}}])
+@pytest.mark.parametrize("keys", sweep([{}, {"light_sampler": {"type": "uniform_lights"}}], [{}]))
 def test_gradients_of_a_surface_that_is_all_black(keys):
     """Direct light and light from the cache, against a finite difference."""
     scene = room(width=6)
@@ -224,11 +225,9 @@ def reference(kind):
     return scene, params, keys, _REFERENCES[kind]
 
 
-@pytest.mark.parametrize("name, kind", [
-    *((name, "diffuse") for name in BY_CACHE), ("nirc", "glossy"), ("nrc", "mirror"),
-    *(pytest.param(name, kind, marks=pytest.mark.slow) for name in BY_CACHE for kind in (
-        "glossy", "mirror", "mask", "sky")),
-])  # fmt: skip
+@pytest.mark.parametrize("name, kind", sweep([
+    (name, kind) for kind in ("diffuse", "glossy", "mirror", "mask", "sky") for name in BY_CACHE
+], [("nirc", "diffuse"), ("neural_path", "diffuse")]))  # fmt: skip
 def test_gradients_by_the_cache_are_those_of_prb(name, kind):
     scene, params, keys, theirs = reference(kind)
     ours = spread_of(scene, params, keys, train(scene, name), 128)
@@ -281,10 +280,11 @@ def warnings():
     logger.add_appender(known)
 
 
-@pytest.mark.parametrize("name, key, lights", [
+@pytest.mark.parametrize("name, key, lights", sweep([
     ("nirc", "floor.bsdf.reflectance.data", {}), ("nrc", "floor.bsdf.reflectance.data", {}), ("nrc", "sky.data", {}),
     ("nrc", "sky.data", {"light_sampler": {"type": "power_lights"}}),
-])  # fmt: skip
+], [("nirc", "floor.bsdf.reflectance.data", {}),
+    ("nrc", "sky.data", {"light_sampler": {"type": "power_lights"}})]))  # fmt: skip
 def test_forward_and_backward_are_transposes(name, key, lights):
     """<δ, J v> = <Jᵀ δ, v> with the same samples; a Gaussian filter, a crop window, channels."""
     film = {"type": "hdrfilm", "width": 16, "height": 12, "crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 8,

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import SLOW, sweep
 from light_scenes import at, glow, picture
 from test_gradients import T, adjoint_image, agree, colour, enable, room, spread_of, tracked, train, wall
 from test_gradients import warnings as warnings  # a fixture
@@ -40,12 +41,12 @@ def lamps(sky=True):
 _TRUE = {}
 
 
-def by_prb(scene, params, keys):
+def by_prb(scene, params, keys, depth=24):
     """Gradients by ``prb`` and their errors, computed once for each list of keys: a BSDF that several shapes share has
     the name of one or another of them, from load to load."""
-    if tuple(keys) not in _TRUE:
-        _TRUE[tuple(keys)] = spread_of(scene, params, keys, mi.load_dict({"type": "prb", "max_depth": 24}), 2048)
-    return _TRUE[tuple(keys)]
+    if (of := (*keys, depth)) not in _TRUE:
+        _TRUE[of] = spread_of(scene, params, keys, mi.load_dict({"type": "prb", "max_depth": depth}), 2048)
+    return _TRUE[of]
 
 
 def by_autodiff(scene, params, keys, integrator, grad, spp, seed):
@@ -56,13 +57,13 @@ def by_autodiff(scene, params, keys, integrator, grad, spp, seed):
     return np.concatenate([np.array(dr.grad(v), np.float64).ravel() for v in given])
 
 
-@pytest.mark.parametrize("sampler", ["power_lights", *(pytest.param(s, marks=pytest.mark.slow) for s in SAMPLERS)])
-def test_plain_path_differentiates_what_lamps_of_all_kinds_send(sampler):
+@pytest.mark.parametrize("sampler, depth", [("power_lights", 3), *(pytest.param(s, 24, marks=SLOW) for s in SAMPLERS)])
+def test_plain_path_differentiates_what_lamps_of_all_kinds_send(sampler, depth):
     scene = lamps()
     params, keys = tracked(scene, LAMP_KEYS)
     assert len([k for k in keys if "reflectance" not in k]) >= 10, keys
-    theirs = by_prb(scene, params, keys)
-    integrator = mi.load_dict({"type": "plain_path", "max_depth": 24, "light_sampler": {"type": sampler}})
+    theirs = by_prb(scene, params, keys, depth)
+    integrator = mi.load_dict({"type": "plain_path", "max_depth": depth, "light_sampler": {"type": sampler}})
     grad = adjoint_image(scene)
     runs = np.array([by_autodiff(scene, params, keys, integrator, grad, 512, 3 + s) for s in range(6)])
     ours = runs.mean(0), runs.std(0, ddof=1) / len(runs) ** 0.5
@@ -83,10 +84,9 @@ def agree_by_key(params, keys, name, ours, theirs, allowed):
         start = end
 
 
-@pytest.mark.parametrize("name, sampler", [
-    ("nrc", "power_lights"), ("nirc", "nvc_lights"),
-    *(pytest.param(n, s, marks=pytest.mark.slow) for n in ("nrc", "nirc", "neural_path") for s in SAMPLERS),
-])  # fmt: skip
+@pytest.mark.parametrize("name, sampler", sweep(
+    [(n, s) for n in ("nrc", "nirc", "neural_path") for s in SAMPLERS], [("nrc", "nvc_lights")]
+))  # fmt: skip
 def test_cached_gradients_choose_lights_by_the_sampler(name, sampler, warnings):
     scene = lamps()
     params, keys = tracked(scene, LAMP_KEYS)

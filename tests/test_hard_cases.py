@@ -10,10 +10,15 @@ import re
 import numpy as np
 import pytest
 import stress
+from cheap import NETWORK, sweep
 from hard_cases import CASES, Case, room
 
 SHORT = ("radiance 1e-6", "radiance 1e6", "far from the origin", "lights off", "albedo 1", "NaN in a texture")
 INTEGRATORS = ("plain_path", "nirc", "nirc_two_level")
+#: Of the default run: each case by one integrator.
+CELLS = [("radiance 1e-6", "nirc"), ("radiance 1e6", "nirc_two_level"), ("far from the origin", "nirc"),
+         ("lights off", "nirc_two_level"), ("albedo 1", "nirc_two_level"),
+         ("NaN in a texture", "plain_path")]  # fmt: skip
 REFUSED = [name for name, case in CASES.items() if case.refusal]
 
 
@@ -35,14 +40,12 @@ def integrators():
     """Integrators that meet all scenes one after the other."""
     import mitsuba as mi
 
-    small = {"train_samples": 512, "train_frames": 48}
-    return {
-        name: mi.load_dict({k: small.get(k, v) for k, v in stress.ENTRANTS[name].keys.items()}) for name in INTEGRATORS
-    }
+    small = {"train_samples": 512, "train_frames": 48, **NETWORK}
+    keys = {name: stress.ENTRANTS[name].keys for name in INTEGRATORS}
+    return {name: mi.load_dict(k | small if "train_frames" in k else k) for name, k in keys.items()}
 
 
-@pytest.mark.parametrize("name", INTEGRATORS)
-@pytest.mark.parametrize("case", SHORT)
+@pytest.mark.parametrize("case, name", sweep([(case, name) for case in SHORT for name in INTEGRATORS], CELLS))
 def test_image_of_a_hard_case_is_finite_and_as_bright_as_it_must_be(case, name, references, integrators):
     entrant = stress.ENTRANTS[name]
     found = stress.cell(CASES[case], entrant, 8, integrator=integrators[name])
@@ -61,7 +64,9 @@ def test_what_cannot_be_rendered_is_refused_in_one_line_by_every_integrator(name
         assert "\n" not in found["refused"] and len(found["refused"]) < 300
 
 
-@pytest.mark.parametrize("case", [name for name, case in CASES.items() if case.media])
+@pytest.mark.parametrize("case", sweep(
+    [name for name, case in CASES.items() if case.media], ["thin medium", "thick medium"]
+))  # fmt: skip
 def test_plain_path_renders_the_media_that_others_refuse(case, integrators):
     entrant = stress.ENTRANTS["plain_path"]
     known = stress.cell(CASES[case], stress.REFERENCES["volpath"], 8, known=True)

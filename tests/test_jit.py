@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK
 from expectation import assert_same_mean
 from test_incident import load
 
-SMALL = {"type": "nirc", "train_samples": 512, "train_frames": 10, "train_steps": 0}
+SMALL = {"type": "nirc", "train_samples": 512, "train_frames": 10, "train_steps": 0, **NETWORK}
 
 
 def render(scene, integrator, spp=4, seed=1):
@@ -180,13 +181,14 @@ import gc, drjit as dr, mi_neural, mitsuba as mi, numpy as np
 mi.set_variant(VARIANT)
 from mi_neural import scenes
 scene = mi.load_file(str(scenes.path("point_lit_sphere")), resx=8, resy=8)
-integrator = mi.load_dict({"type": "nirc", "train_samples": 256, "train_frames": 2, "train_steps": 1, "levels": 4})
+integrator = mi.load_dict({"type": "nirc", "train_samples": 256, "train_frames": 2, "train_steps": 1, "levels": 2,
+                          "hashmap_size": 256, "width": 8})
 
 class Loop:
     pass
 
 def litter():
-    for _ in range(200):
+    for _ in range(20):
         loop = Loop()
         loop.me, loop.array = loop, mi.Float(np.ones(64, np.float32))
 

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import SLOW, sweep
 from expectation import assert_same_mean, renders
 from light_scenes import mixed_lights
 from media_scenes import cube, everywhere, fog, rgb, room
@@ -96,8 +97,10 @@ def test_lights_that_change_are_seen():
     assert isinstance(integrator.lights, CellLights)
 
 
-@pytest.mark.parametrize("how", ["cells", "network"])
-@pytest.mark.parametrize("name", ["camera inside", "colours"])
+@pytest.mark.parametrize("name, how", sweep(
+    [(name, how) for name in ("camera inside", "colours") for how in ("cells", "network")],
+    [("colours", "network")],
+))  # fmt: skip
 def test_image_is_that_of_volpath(name, how):
     make, reference = {"camera inside": (lambda: everywhere(fog(0.4, 0.8)), "volpath"),
                        "colours": (lambda: room(box=cube(fog((0.5, 2.0, 4.0), (0.9, 0.6, 0.8)))), "volpathmis")}[name]
@@ -120,7 +123,7 @@ def many_lamps(n: int) -> mi.Scene:
     return everywhere(fog(0.5), **parts)
 
 
-@pytest.mark.parametrize("n", [30, 1000])
+@pytest.mark.parametrize("n", [30, pytest.param(1000, marks=SLOW)])
 def test_many_hidden_lamps_in_fog_are_finite(n):
     """Where lamps touch plates, and lie in one another."""
     scene = many_lamps(n)

@@ -1,5 +1,6 @@
 """Groups of lights, bounds on what they give, and how one is chosen."""
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -7,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import sweep
 from expectation import ERROR_RATE
 from light_scenes import (
     MIXED,
@@ -225,8 +227,10 @@ def received(corners, normals, x, n, two_sided=False, steps=12) -> np.ndarray:
     return (np.where((cos_i > eps) & (cos_l > eps), cos_i * cos_l, 0) / d2).max(axis=1)
 
 
-@pytest.mark.parametrize("two_sided", [False, True])
-@pytest.mark.parametrize("scale", [1e-4, 1, 1e5])
+@pytest.mark.parametrize("scale, two_sided", sweep(
+    [(scale, two_sided) for scale in (1e-4, 1, 1e5) for two_sided in (False, True)],
+    [(1e-4, True), (1, False), (1e5, True)],
+))  # fmt: skip
 def test_importance_is_positive_wherever_a_point_of_the_light_can_be_seen(tmp_path, rng, scale, two_sided):
     """Random triangles, near and far receivers, groups of 1 and of several; and no more than 4 times too small."""
     corners, table = shining_triangles(tmp_path, rng, scale)
@@ -323,6 +327,9 @@ ALL = [
     *[("mixed", name) for name in ("uniform", "power", "tree", "unshadowed", "predicted", "clusters", "one candidate")],
     *[("swarm", name) for name in ("uniform", "power", "tree", "clusters", "one candidate")],
 ]
+#: Of the default run.
+SOME = [*(("mixed", name) for name in ("uniform", "power", "tree", "predicted")), ("swarm", "tree"),
+        ("swarm", "clusters")]  # fmt: skip
 PLACES = [([0.2, 0.1, 0.3], [0, 0, 1]), ([-1.5, 1, 2], [0.6, 0, -0.8]), ([0, 0, 3], [0, 0, 1])]
 
 
@@ -370,7 +377,7 @@ def test_probability_of_the_light_met_is_its_probability(choosers, where, name):
     np.testing.assert_allclose(chosen[some], pmf[index.astype(int)][some], rtol=1e-4)
 
 
-@pytest.mark.parametrize("where, name", [w for w in ALL if w[1] not in ("clusters", "one candidate")])
+@pytest.mark.parametrize("where, name", sweep([w for w in ALL if w[1] not in ("clusters", "one candidate")], SOME[:-1]))
 def test_lights_are_chosen_as_often_as_their_probability_says(choosers, where, name):
     sampler = choosers[where][name]
     for k, (p, n) in enumerate(PLACES):
@@ -385,7 +392,7 @@ def test_lights_are_chosen_as_often_as_their_probability_says(choosers, where, n
         assert_frequencies(counts, known, f"{where}, {name}, place {k}")
 
 
-@pytest.mark.parametrize("where, name", ALL)
+@pytest.mark.parametrize("where, name", sweep(ALL, SOME))
 def test_every_light_that_may_contribute_weighs_one_in_the_mean(choosers, where, name):
     """E[1{light} weight] = 1; z-test, Šidák's correction over the lights. Rarely chosen ones are taken together."""
     sampler = choosers[where][name]
@@ -440,10 +447,11 @@ def test_predictions_that_are_no_number_leave_every_light_possible(mixed, value)
     assert np.isfinite(pmf).all() and (pmf[can] > 0).all() and pmf.sum() == pytest.approx(1, rel=1e-4)
 
 
-@pytest.mark.parametrize("n_outputs", [32, 4])
-@pytest.mark.parametrize("position", [0.0, 1e5])
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e4])
-@pytest.mark.parametrize("intensity", [(1e-30, 1e-30), (1e30, 1e30), (1e-30, 1e30)])
+@pytest.mark.parametrize("intensity, size, position, n_outputs", sweep(
+    itertools.product([(1e-30, 1e-30), (1e30, 1e30), (1e-30, 1e30)], [1e-6, 1.0, 1e4], [0.0, 1e5], [32, 4]),
+    [((1e-30, 1e-30), 1e-6, 1e5, 4), ((1e30, 1e30), 1e4, 1e5, 4),
+     *itertools.product([(1e-30, 1e30)], [1e-6, 1.0, 1e4], [0.0, 1e5], [32])],
+))  # fmt: skip
 def test_extreme_lights_give_finite_probabilities(tmp_path, rng, intensity, size, position, n_outputs):
     """Receivers far away, near, and on a light."""
     offset = np.array([position, 0, 0])

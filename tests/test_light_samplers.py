@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW, sweep
 from expectation import assert_same_mean, renders
 from light_scenes import glow, picture, random_triangles, row, triangles
 from test_vertex import lights, test_scene
@@ -20,13 +21,13 @@ SAMPLERS = {
     "uniform": {"type": "uniform_lights"},
     "power": {"type": "power_lights"},
     "tree": {"type": "tree_lights"},
-    "trained": {"type": "nvc_lights", "train_frames": 30, "train_steps": 0, "train_samples": 1024},
+    "trained": {"type": "nvc_lights", "train_frames": 30, "train_steps": 0, "train_samples": 1024, "levels": 4},
     "untrained": {"type": "nvc_lights", "train_frames": 0, "train_steps": 0, "train_samples": 64},
     "unshadowed": {"type": "nvc_lights", "visibility": False},
     "clusters": {"type": "nvc_lights", "outputs": 8, "clusters": "kmeans", "train_frames": 20, "train_steps": 0,
-                 "train_samples": 512},
+                 "train_samples": 512, "levels": 4},
     "cells": {"type": "nvc_lights", "environment_cells": 16, "train_frames": 30, "train_steps": 0,
-              "train_samples": 1024},
+              "train_samples": 1024, "levels": 4},
     "untrained cells": {"type": "nvc_lights", "environment_cells": 8, "train_frames": 0, "train_steps": 0},
 }  # fmt: skip
 
@@ -92,7 +93,7 @@ def place(tmp_path_factory):
 # ---------------------------------------------------------------- images
 
 
-@pytest.mark.parametrize("kind, name", [
+@pytest.mark.parametrize("kind, name", sweep([
     *[("two", name) for name in ("power", "tree", "trained")],
     *[("kinds", name) for name in ("uniform", "tree", "trained", "untrained", "clusters", "cells")],
     *[("32", name) for name in ("tree", "trained", "clusters")],
@@ -100,7 +101,8 @@ def place(tmp_path_factory):
     *[("spotted", name) for name in ("uniform", "tree", "trained")],
     *[("envmap", name) for name in ("cells", "untrained cells")],
     ("constant", "cells"),
-])  # fmt: skip
+], [*[("kinds", name) for name in ("uniform", "tree", "trained", "clusters")], ("mesh", "clusters"),
+    ("spotted", "trained"), ("envmap", "cells")]))  # fmt: skip
 def test_image_is_that_of_path(place, kind, name):
     scene, path = place(kind)
     assert_same_mean(renders(scene, path_with(name), 16, 256), path, f"{kind}, {name}", relative=1e-5)
@@ -109,7 +111,7 @@ def test_image_is_that_of_path(place, kind, name):
 # ---------------------------------------------------------------- predicted direct light in deep bounces
 
 
-@pytest.mark.slow
+@SLOW
 def test_direct_light_predicted_deep_down_is_nearly_that_of_path(place):
     """A preview: within 15 % of the mean; without shadows the indirect half would be off by half."""
     scene, path = place("32", 3)
@@ -136,22 +138,24 @@ def test_neural_depth_that_cannot_be_is_refused(keys, says):
         mi.load_dict({"type": "plain_path", **keys})
 
 
-def test_neural_depth_with_clusters_is_refused_by_render(place):
-    scene, _ = place("32", 3)
+def test_neural_depth_with_clusters_is_refused_by_render():
+    scene = test_scene(many("32", None), 8)
     integrator = mi.load_dict({"type": "plain_path", "neural_depth": 1, "light_sampler": SAMPLERS["clusters"]})
     with pytest.raises(ValueError, match=r"there are 32 for 8 outputs; raise outputs"):
         integrator.render(scene, spp=1)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ["tree", "trained", "clusters"])
 def test_image_of_longer_paths_is_that_of_path(place, name):
     scene, path = place("kinds", 4)
     assert_same_mean(renders(scene, path_with(name, 4), 16, 128), path, name, relative=1e-5)
 
 
-@pytest.mark.parametrize("kind, nonsense", [("kinds", "random"), ("two", "NaN"), ("32", "inverted"),
-                                            ("envmap", "inverted")])
+@pytest.mark.parametrize("kind, nonsense", sweep(
+    [("kinds", "random"), ("two", "NaN"), ("32", "inverted"), ("envmap", "inverted")],
+    [("kinds", "random"), ("two", "NaN"), ("envmap", "inverted")],
+))  # fmt: skip
 def test_network_that_says_nonsense_gives_the_same_image(place, kind, nonsense):
     scene, path = place(kind)
     integrator = path_with("cells" if kind == "envmap" else "trained")
@@ -213,7 +217,7 @@ def _registered():
     mi.register_integrator("by_chance", lambda props: ByChance(props))
 
 
-@pytest.mark.parametrize("kind", ["area", "point", "envmap"])
+@pytest.mark.parametrize("kind", sweep(("area", "point", "envmap"), ("area",)))
 def test_single_light_costs_and_changes_nothing(kind):
     scene = test_scene(lights(kind), 8)
     plain = np.array(mi.load_dict({"type": "plain_path", "max_depth": 3}).render(scene, spp=16, seed=5))
@@ -232,7 +236,7 @@ def nirc(name, **keys):
     )
 
 
-@pytest.mark.parametrize("name", ["power", "untrained"])
+@pytest.mark.parametrize("name", sweep(("power", "untrained"), ("untrained",)))
 def test_as_on_a_gpu_image_is_that_of_path(monkeypatch, place, name):
     """There emitters that sample themselves are called through pointers."""
     monkeypatch.setattr("mi_neural.lights.table.on_gpu", lambda: True)
@@ -248,13 +252,15 @@ def test_parts_of_the_environment_are_refused_on_a_gpu(monkeypatch, place):
         path_with("cells").render(place("envmap")[0], spp=1)
 
 
-@pytest.mark.parametrize("name, depth", [("power", 2), ("tree", 4), ("clusters", 2), ("trained", 4)])
+@pytest.mark.parametrize("name, depth", sweep(
+    [("power", 2), ("tree", 4), ("clusters", 2), ("trained", 4)], [("power", 2)]
+))  # fmt: skip
 def test_nirc_without_its_cache_is_path(place, name, depth):
     scene, path = place("kinds", depth)
     assert_same_mean(renders(scene, nirc(name, max_depth=depth), 16, 32), path, f"{name}, {depth}", relative=1e-5)
 
 
-@pytest.mark.slow
+@SLOW
 def test_nirc_with_a_trained_cache_is_near_path(place):
     """The cache is biased by a little; light lost or counted twice shows."""
     scene, path = place("kinds", -1)
@@ -265,7 +271,10 @@ def test_nirc_with_a_trained_cache_is_near_path(place):
     assert image.mean() == pytest.approx(path.mean(), rel=0.03)
 
 
-@pytest.mark.parametrize("type_, name", [*[("plain_path", n) for n in SAMPLERS], ("nirc", "trained")])
+@pytest.mark.parametrize("type_, name", sweep(
+    [*[("plain_path", n) for n in SAMPLERS], ("nirc", "trained")],
+    [*[("plain_path", n) for n in ("uniform", "tree", "trained", "cells")], ("nirc", "trained")],
+))  # fmt: skip
 def test_lights_that_are_off_give_a_black_image(name, type_):
     off = {"a": {"type": "point", "position": [0, 2, 0], "intensity": 0.0},
            "b": {"type": "rectangle", "to_world": at(0, 2, 0).rotate([1, 0, 0], 90), "emitter": glow(0.0)}}  # fmt: skip
@@ -402,7 +411,7 @@ def test_table_is_made_once_where_no_light_changes():
 
 
 @pytest.mark.parametrize("key", [
-    pytest.param("lamp.emitter.radiance.value", marks=pytest.mark.slow), "spark.intensity.value",
+    pytest.param("lamp.emitter.radiance.value", marks=SLOW), "spark.intensity.value",
 ])  # fmt: skip
 def test_light_that_is_dimmed_is_not_recorded_anew(key):
     """NumPy's memory, aligned by chance, must not reach frozen functions. Two lights: more are larger kernels."""
@@ -410,7 +419,7 @@ def test_light_that_is_dimmed_is_not_recorded_anew(key):
                         "spark": {"type": "point", "position": [-1.5, 1.5, 1.5], "intensity": 2.0}}, 8)  # fmt: skip
     sampler = {"type": "nvc_lights", "train_frames": 2, "train_samples": 64}
     nirc_ = mi.load_dict({"type": "nirc", "train_samples": 64, "train_frames": 2, "light_samples": 1,
-                          "light_sampler": sampler})  # fmt: skip
+                          "light_sampler": sampler, **NETWORK})  # fmt: skip
     plain = mi.load_dict({"type": "plain_path", "max_depth": 2, "light_sampler": sampler})
     params = mi.traverse(scene)
     key = key if key in params else next(k for k in params.keys() if k.endswith(key.split(".", 1)[1]))
@@ -430,9 +439,9 @@ def test_light_that_is_dimmed_is_not_recorded_anew(key):
     assert counts[-1] == counts[3] and max(counts[-1]) <= 3
 
 
-def test_frozen_image_is_the_one_that_is_not_frozen(place):
+def test_frozen_image_is_the_one_that_is_not_frozen():
     """Whatever the seed and the number of samples; and a key that changes is seen."""
-    scene, _ = place("two")
+    scene = test_scene(many("two", None), 12)
     frozen, plain = path_with("unshadowed", 4), path_with("unshadowed", 4)
     plain.records = False
     for seed, spp in ((0, 4), (1, 4), (2, 4), (3, 2), (4, 4)):
@@ -454,7 +463,7 @@ def test_another_scene_is_learned_anew_even_where_the_first_is_gone():
         del scene
 
 
-@pytest.mark.parametrize("name", ["tree", "clusters"])
+@pytest.mark.parametrize("name", sweep(("tree", "clusters"), ("clusters",)))
 def test_image_after_a_change_is_that_of_a_fresh_integrator(name):
     """The pass is frozen: what it knows of lights must be recorded anew where it changes. The 24 triangles are grouped
     otherwise once they move, and a lamp gets a picture that it had not."""
@@ -509,8 +518,8 @@ def test_frozen_pass_learns_that_groups_have_other_sizes(tmp_path):
 # ---------------------------------------------------------------- bad input
 
 
-def test_seeds_may_have_more_than_32_bits(place):
-    scene, _ = place("two")
+def test_seeds_may_have_more_than_32_bits():
+    scene = test_scene(many("two", None), 8)
     integrator = path_with({"type": "nvc_lights", "train_frames": 1, "train_samples": 64, "seed": 2**40})
     first = np.array(integrator.render(scene, spp=1))
     integrator.reseed(2**40 + 1)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW, sweep
 from expectation import assert_same_mean, renders
 from light_scenes import (
     MIXED,
@@ -160,8 +161,10 @@ def test_nodes_bound_their_lights(mixed, rng, tmp_path):
             assert nodes["intensity"][node] == pytest.approx(power[inside].sum(), rel=1e-9)
 
 
-@pytest.mark.parametrize("two_sided", [False, True])
-@pytest.mark.parametrize("scale", [1e-4, 1, 1e5])
+@pytest.mark.parametrize("scale, two_sided", sweep(
+    [(scale, two_sided) for scale in (1e-4, 1, 1e5) for two_sided in (False, True)],
+    [(1e-4, False), (1, True), (1e5, False)],
+))  # fmt: skip
 def test_no_light_that_reaches_a_point_has_probability_zero(tmp_path, rng, scale, two_sided):
     """Every tenth point lies on a light: in the bounds of many nodes, and in the plane of a triangle."""
     corners, table = shining_triangles(tmp_path, rng, scale)
@@ -349,9 +352,10 @@ def test_image_of_lights_that_move_is_not_recorded_anew():
 
 
 @pytest.mark.parametrize("keys", [
-    {"type": "nirc_two_level", "max_depth": 4, "train_samples": 256, "train_frames": 16, "train_steps": 0},
+    pytest.param({"type": "nirc_two_level", "max_depth": 4, "train_samples": 256, "train_frames": 16, "train_steps": 0,
+                  **NETWORK}, marks=SLOW),
     {"type": "nvc_direct", "max_depth": 2},
-    {"type": "restir_di", "candidates": "nvc", "history": 0},
+    pytest.param({"type": "restir_di", "candidates": "nvc", "history": 0}, marks=SLOW),
 ], ids=lambda keys: keys["type"])  # fmt: skip
 def test_image_with_it_nested_is_that_of_path(keys):
     scene = test_scene(lights("all"), 12)

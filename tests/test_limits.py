@@ -12,13 +12,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW
 from expectation import assert_same_mean, renders
 from hard_cases import Room, room
 
 from mi_neural.integrators import checks
 from mi_neural.render.frozen import undisturbed
 
-SMALL = {"train_samples": 256, "train_frames": 8, "train_steps": 1, "levels": 4, "hashmap_size": 2**12}
+SMALL = {"train_samples": 256, "train_frames": 8, "train_steps": 1, **NETWORK}
 ALL = {
     "plain_path": {"type": "plain_path"},
     "nvc_direct": {"type": "nvc_direct"},
@@ -96,7 +97,7 @@ def test_every_integrator_refuses_a_film_that_does_not_fit(name, monkeypatch, sc
         mi.load_dict(ALL[name]).render(scene, spp=1)
 
 
-@pytest.mark.parametrize("name", ["plain_path", "nvc_direct"])
+@pytest.mark.parametrize("name", ["plain_path", pytest.param("nvc_direct", marks=SLOW)])
 def test_image_in_several_passes_has_the_mean_of_one(name, scene, monkeypatch):
     """As many samples as fit: 3 + 3 + 2 of 8. A false alarm in 10,000 choices of seed."""
     keys = {**ALL[name], "hide_emitters": True}  # the lights themselves are the most of the noise
@@ -204,7 +205,7 @@ def test_integrator_goes_on_after_ctrl_c_while_it_was_recorded(place, call, scen
     assert count[0] >= call and found.mean() == pytest.approx(known, rel=0.1)
 
 
-@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("first", [pytest.param(True, marks=SLOW), False])
 def test_integrator_goes_on_after_ctrl_c_while_it_planned(first):
     """In its first scene, or in another after that."""
     lamps, other = room()(), room(extra={"spark": None})()

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import sweep
 from load_study import load_study
 
 from mi_neural.lights import ltc
@@ -63,8 +64,9 @@ def brute_force(p, area) -> float:
 # ---------------------------------------------------------------- polygons
 
 
-@pytest.mark.parametrize("n_vertices", [3, 4])
-@pytest.mark.parametrize("size", [1e-3, 0.1, 0.5, 1.5])
+@pytest.mark.parametrize("size, n_vertices", sweep(
+    [(size, n) for size in (1e-3, 0.1, 0.5, 1.5) for n in (3, 4)], [(1e-3, 4), (0.5, 3), (1.5, 4)]
+))  # fmt: skip
 def test_form_factor_is_that_of_brute_force(n_vertices, size, rng):
     polygons = summable(random_parallelograms(rng, 40, size), 0.05 * size)[:24, :n_vertices]
     clipped = ((polygons[..., 2] > 0).any(1) & (polygons[..., 2] < 0).any(1)).sum()
@@ -262,7 +264,7 @@ TOLERANCE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("alpha, cos_theta", TOLERANCE)
+@pytest.mark.parametrize("alpha, cos_theta", sweep(TOLERANCE, [c for c in TOLERANCE if c[1] not in (0.5, 0.9)]))
 def test_ggx_of_polygons_is_that_of_brute_force(alpha, cos_theta, rng):
     """Quads of three sizes around the mirror direction, some below the horizon; any azimuth of the view."""
     turn = rng.uniform(0, 2 * np.pi)

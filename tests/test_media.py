@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW, sweep
 from expectation import assert_same_mean, renders
 from media_scenes import ball, clouds, cube, everywhere, fog, lamp, rgb, room, smoke
 
@@ -72,6 +73,10 @@ VARIANTS = ("llvm_ad_mono", "llvm_ad_spectral")
 IN_VARIANTS = [("colours", "nvc"), ("coloured smoke", None), ("camera in colours", "uniform")]
 LIMITS = [{"max_depth": 1}, {"max_depth": 2}, {"max_depth": 3, "rr_depth": 1}, {"max_depth": -1, "rr_depth": 2},
           {"max_depth": 4, "hide_emitters": True}]  # fmt: skip
+#: Of the default run: media, boundaries and ways of choosing lights of each kind.
+DEFAULT = [("homogeneous", None), ("homogeneous", "power"), ("heterogeneous", "nvc"), ("colours", None),
+           ("camera inside", "uniform"), ("nested", None), ("instances", None), ("half open shell", "tree"),
+           ("sky", "cells")]  # fmt: skip
 #: Comparisons of this file with a reference; together they fail by chance one choice of seeds in ten thousand.
 N_TESTS = len(SCENES) + len(CHOSEN) + len(VARIANTS) * len(IN_VARIANTS) + len(LIMITS) + 8
 DEPTH = {"max_depth": 8}
@@ -94,9 +99,9 @@ def seen():
 
 
 # One scene after another, each by all samplers: its reference is rendered once
-@pytest.mark.parametrize("name, sampler", [
-    (name, sampler) for name in SCENES for sampler in (None, *(s for n, s in CHOSEN if n == name))
-])  # fmt: skip
+@pytest.mark.parametrize("name, sampler", sweep(
+    [(name, sampler) for name in SCENES for sampler in (None, *(s for n, s in CHOSEN if n == name))], DEFAULT
+))  # fmt: skip
 def test_image_is_that_of_volpath(seen, name, sampler):
     make, reference = SCENES[name]
     if name not in seen:
@@ -107,8 +112,10 @@ def test_image_is_that_of_volpath(seen, name, sampler):
     seen[name] = scene, compare(f"{name}, {sampler}", scene, reference, keys, known=known)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("name, sampler", IN_VARIANTS)
+@pytest.mark.parametrize("variant, name, sampler", sweep(
+    [(variant, *case) for variant in VARIANTS for case in IN_VARIANTS],
+    [("llvm_ad_mono", "coloured smoke", None), ("llvm_ad_spectral", "colours", "nvc")],
+))  # fmt: skip
 def test_image_in_mono_and_spectral_variants(variant, name, sampler):
     mi.set_variant(variant)
     make, reference = SCENES[name]
@@ -124,7 +131,7 @@ def both_shells():
         seen=lamp((0, 0.2, -0.8), rgb(1.0, 2.0, 3.0), 0.2), sky={"type": "constant", "radiance": 0.2})  # fmt: skip
 
 
-@pytest.mark.parametrize("limits", LIMITS)
+@pytest.mark.parametrize("limits", sweep(LIMITS, (LIMITS[4],)))
 def test_depths_roulette_and_hidden_emitters_are_those_of_volpath(both_shells, limits):
     compare(str(limits), both_shells, "volpath", {}, **limits)
 
@@ -136,14 +143,13 @@ def test_coverage_is_that_of_volpath(hide):
     keys = {"max_depth": 4, "hide_emitters": hide}
 
     def alpha(kind, first):
-        integrator = mi.load_dict({"type": kind, **keys})
-        images = [mi.render(scene, integrator=integrator, spp=64, seed=first + k) for k in range(16)]
-        return np.repeat(np.array(images)[..., 3:4], 3, axis=-1).astype(np.float64)
+        images = renders(scene, {"type": kind, **keys}, 16, 64, first, channels=slice(3, 4))
+        return np.repeat(images, 3, axis=-1)
 
     assert_same_mean(alpha("plain_path", 0), alpha("volpath", 500), "alpha", blocks=2, relative=1e-4, tests=N_TESTS)
 
 
-@pytest.mark.parametrize("wrapper", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}])
+@pytest.mark.parametrize("wrapper", [{"type": "moment"}, pytest.param({"type": "aov", "aovs": "d:depth"}, marks=SLOW)])
 def test_wrappers_know_the_medium_of_the_camera(wrapper):
     make, reference = SCENES["camera inside"]
     scene = make()
@@ -172,7 +178,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("name", sweep(CHANGES, ("density",)))
 def test_image_follows_what_changes_in_a_medium(name):
     key, change = CHANGES[name]
     medium = smoke() if name == "density" else fog(2.0, 0.8, g=0.8)
@@ -206,14 +212,12 @@ def test_camera_that_walks_into_the_medium():
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     outside = mi.load_dict({"type": "perspective", "fov": 20, "to_world": place, "film": film})
 
-    def images(what, sensor, first):
-        return np.array([mi.render(scene, sensor=sensor, integrator=what, spp=64, seed=first + k) for k in range(16)],
-                        np.float64)  # fmt: skip
-
-    volpath = mi.load_dict({"type": "volpath", **DEPTH})
+    volpath, known = {"type": "volpath", **DEPTH}, {}
     for name, sensor in (("outside", outside), ("inside", scene.sensors()[0]), ("outside again", outside)):
-        known, ours = images(volpath, sensor, 500), images(integrator, sensor, 0)
-        assert_same_mean(ours, known, name, blocks=1, relative=1e-4, tests=N_TESTS)
+        if sensor not in known:
+            known[sensor] = renders(scene, volpath, 16, 64, 500, sensor)
+        ours = renders(scene, integrator, 16, 64, 0, sensor)
+        assert_same_mean(ours, known[sensor], name, blocks=1, relative=1e-4, tests=N_TESTS)
 
 
 # ---------------------------------------------------------------- refusals
@@ -389,11 +393,11 @@ def kernels(scene, keys: dict) -> set[str]:
     return codes
 
 
-@pytest.mark.parametrize("sampler", ["none", "power", "nvc", "nrc", "neural_path"])
+@pytest.mark.parametrize("sampler", ["none", "power", "nvc", pytest.param("nrc", marks=SLOW), "neural_path"])
 def test_scene_without_media_compiles_to_kernels_of_surfaces_alone(sampler, monkeypatch):
     scene, keys = room(), {"type": "plain_path", **DEPTH}
     if sampler in ("nrc", "neural_path"):
-        keys = {"type": sampler, "train_frames": 2, "train_samples": 256, **DEPTH}
+        keys = {"type": sampler, "train_frames": 2, "train_samples": 256, **NETWORK, **DEPTH}
     elif sampler != "none":
         keys["light_sampler"] = SAMPLERS[sampler]
     kernels(scene, keys)  # its first recording has the scene's own parts evaluated

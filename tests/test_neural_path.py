@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW
 from expectation import assert_mean, assert_same_mean, renders
 from scipy import ndimage
 from test_incident import load
@@ -25,9 +26,8 @@ from mi_neural.estimators.spread import grown
 from mi_neural.integrators.neural_path import DENOISED_SAMPLES, LEAST_STEPS, YOUNG, denoised_threshold, young_threshold
 from mi_neural.render.kernels import on_gpu
 
-SLOW = pytest.mark.slow
 #: Caches that are trained in a second.
-SMALL = {"train_samples": 512, "train_frames": 60, "train_steps": 0}
+SMALL = {"train_samples": 512, "train_frames": 60, "train_steps": 0, **NETWORK}
 BOX = ([0.0] * 3, [1.0] * 3)
 
 
@@ -265,7 +265,7 @@ def test_denoised_images_learn_from_more_paths_without_an_end():
     assert shares == [0.25, 0.5, 0.1]
 
 
-@pytest.mark.parametrize("denoised", [False, True])
+@pytest.mark.parametrize("denoised", [pytest.param(False, marks=SLOW), True])
 def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
     force(integrator, ratio=0.02)
@@ -280,9 +280,9 @@ def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     ("nirc", {"light_samples": 2, "channels": "direct"}), ("nrc", {"blend": "ema", "reliability_kappa": 3.0}),
 ])  # fmt: skip
 def test_older_name_still_works_and_says_the_new_one(plugin, keys, box, capfd):
-    old = mi.load_dict({"type": plugin, **SMALL, "termination": "auto", **keys})
+    old = mi.load_dict({"type": plugin, **SMALL, "train_frames": 8, "termination": "auto", **keys})
     assert "type: neural_path" in "".join(capfd.readouterr())
-    new = auto(**({"channels": "traced"} if "channels" in keys else {}))
+    new = auto(train_frames=8, **({"channels": "traced"} if "channels" in keys else {}))
     assert type(old) is type(new) and str(old) == str(new) and old.channels == new.channels
     # Trained: equal but for the order of sums
     np.testing.assert_allclose(render(box, old, 4), render(box, new, 4), rtol=0.03, atol=1e-3)
@@ -303,7 +303,7 @@ def test_known_answer_within_two_percent(sphere):
 
 def test_mix_has_less_error_than_either_part():
     """The cache at the first surface alone, tracing alone, and the mix, at 64 samples."""
-    box = mi.load_file(str(scenes.path("cornell_box")), resx=48, resy=48)
+    box = mi.load_file(str(scenes.path("cornell_box")), resx=32, resy=32)
     trained = auto(train_samples=1024)
     trained.train(box, 200)
     path = np.array(mi.render(box, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
@@ -373,7 +373,7 @@ def test_saved_caches_give_the_same_image(trained, box, sphere, tmp_path):
 def test_cache_is_that_of_nrc_and_back(trained, box, tmp_path):
     """A file of either serves both; what was not measured is not trusted at the first surface."""
     trained.save_cache(tmp_path / "measured")
-    plain = mi.load_dict({"type": "nrc", "freeze_cache": True, "spread_threshold": 0.0})
+    plain = mi.load_dict({"type": "nrc", "freeze_cache": True, "spread_threshold": 0.0, **NETWORK})
     plain.load_cache(tmp_path / "measured", box)
     known = render(box, outgoing_alone(trained, box, spread_threshold=0.0), 4)
     np.testing.assert_array_equal(render(box, plain, 4), known)

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW, sweep
 from expectation import assert_same_mean, renders
 from test_incident import load
 from test_vertex import LIGHTS, lights, test_scene
@@ -19,10 +20,10 @@ from test_vertex import LIGHTS, lights, test_scene
 import mi_neural
 from mi_neural.caches.field import CacheFileError
 
-SLOW = pytest.mark.slow  # more of what the default run shows at one value
 TERMINATIONS = ("adaptive", "primary", "spread", "balanced", "balanced_shares")
-#: A cache that is trained in a second.
-SMALL = {"type": "nirc", "train_samples": 512, "train_frames": 60, "train_steps": 0}
+#: Trained in a second.
+TRAINED = {"type": "nirc", "train_samples": 512, "train_frames": 60, "train_steps": 0}
+SMALL = {**TRAINED, **NETWORK}
 
 
 def nirc(**keys):
@@ -77,15 +78,16 @@ def trained(sphere):
 # ---------------------------------------------------------------- analytic
 
 
-@pytest.mark.parametrize("name, termination", [
-    *[("lit_cube", t) for t in (*TERMINATIONS, "denoised")],
-    *[("point_lit_sphere", t) for t in ("adaptive", "denoised")],
-])  # fmt: skip
+@pytest.mark.parametrize("name, termination", sweep(
+    [*[("lit_cube", t) for t in (*TERMINATIONS, "denoised")],
+     *[("point_lit_sphere", t) for t in ("adaptive", "denoised")]],
+    [("lit_cube", "adaptive"), ("point_lit_sphere", "denoised")],
+))  # fmt: skip
 def test_known_answer_within_two_percent_by_every_termination(name, termination):
     """Emission lost or counted twice at any vertex is off by an eighth or more."""
     scene, _ = load(name)
     keys = {"denoised": True} if termination == "denoised" else {"termination": termination}
-    integrator = nirc(**keys, train_samples=1024)
+    integrator = mi.load_dict({**TRAINED, **keys, "train_samples": 1024})  # with the default network
     image = render(scene, integrator, 64)
     print(f"{name}, {termination}: mean {image.mean():.4f} (known 1), after {integrator.cache.steps} training frames")
     assert integrator.cache.steps == 60
@@ -112,7 +114,9 @@ def test_right_cache_gives_the_right_image_by_every_termination(sphere, terminat
     assert abs(error) <= bound
 
 
-@pytest.mark.parametrize("depth, known", [(0, 0), (1, 0.5), (2, 0.75), (3, 0.875), (4, 0.9375), (-1, 1)])
+@pytest.mark.parametrize("depth, known", sweep(
+    [(0, 0), (1, 0.5), (2, 0.75), (3, 0.875), (4, 0.9375), (-1, 1)], [(0, 0), (1, 0.5), (3, 0.875)]
+))
 def test_without_cache_the_lit_cube_has_the_radiance_of_its_depth(cube, depth, known):
     image = render(cube, nirc(cache_samples=0, max_depth=depth), 256)
     print(f"depth {depth}: {image.mean():.5f}, known {known}")
@@ -149,7 +153,7 @@ def test_scene_without_indirect_light_is_that_of_path_however_dim():
 # ---------------------------------------------------------------- limit cases
 
 
-@pytest.mark.parametrize("depth", [3, -1, *(pytest.param(d, marks=SLOW) for d in (1, 2, 5))])
+@pytest.mark.parametrize("depth", sweep((-1, 1, 2, 3, 5), (-1,)))
 def test_without_cache_it_is_path(mixed, depth):
     """cache_samples = 0: glass sphere, rough and smooth lobes, all lights."""
     ours = renders(mixed, {"type": "nirc", "cache_samples": 0, "max_depth": depth}, 24, 32)
@@ -157,14 +161,7 @@ def test_without_cache_it_is_path(mixed, depth):
     assert_same_mean(ours, path, f"depth {depth}", relative=1e-5)
 
 
-@pytest.mark.parametrize(
-    "depth, hide",
-    [
-        (2, False),
-        (2, True),
-        *(pytest.param(1, h, marks=SLOW) for h in (False, True)),
-    ],
-)
+@pytest.mark.parametrize("depth, hide", sweep([(2, False), (2, True), (1, False), (1, True)], [(2, True)]))
 def test_up_to_depth_two_it_is_path(mixed, depth, hide):
     """With its cache: none is asked, and none is trained."""
     integrator = nirc(max_depth=depth, hide_emitters=hide)
@@ -213,7 +210,7 @@ def test_denoised_images_take_paths_that_stop_later_the_more_samples_there_are()
     assert not any(nirc(**k).one_path for k in [*keys, {}])
 
 
-@pytest.mark.parametrize("keys", [{}, {"denoised": True}], ids=str)
+@pytest.mark.parametrize("keys", [{}, pytest.param({"denoised": True}, marks=SLOW)], ids=str)
 def test_prepared_passes_need_no_kernel_in_an_image_of_many_samples(keys):
     """As a budget renders: passes of one sample of an image that is planned to have more."""
     scene = load("point_lit_sphere", 16)[0]
@@ -261,7 +258,7 @@ def test_balanced_stops_and_saves_the_ray(sphere):
     """The more the cache counts, the fewer rays; nearly all paths stop at what the camera sees with many samples."""
     depths = []
     for n in (1, 8, 10**6):
-        integrator = nirc(termination="balanced", cache_samples=n, channels="depth")
+        integrator = nirc(termination="balanced", cache_samples=n, channels="depth", train_frames=2)
         depths.append(render(sphere, integrator, 16)[..., -1].mean())
         assert integrator.statistics()["queries"] == 16 * 16 * 16, "one query a camera sample"
     print(f"segments {depths}")
@@ -419,7 +416,7 @@ def test_frozen_cache_is_not_trained(sphere):
 
 
 def test_another_scene_starts_anew_even_where_the_deleted_first_one_lay():
-    integrator = nirc(train_frames=4, train_steps=1, train_samples=256)
+    integrator = nirc(train_frames=4, train_steps=1, train_samples=256, light_sampler={"type": "uniform_lights"})
     for light in (0.5, 5.0):
         scene, _ = load(light=light, size=8)
         render(scene, integrator, 1)
@@ -498,7 +495,7 @@ def test_saved_cache_gives_the_same_image(sphere, cube, trained, tmp_path):
     with pytest.raises(CacheFileError, match="another scene"):
         nirc().load_cache(tmp_path / "c", cube)
     with pytest.raises(CacheFileError, match="same sizes"):
-        nirc(width=16).load_cache(tmp_path / "c")
+        nirc(width=8).load_cache(tmp_path / "c")
     with pytest.raises(CacheFileError, match="no cache file"):
         nirc().load_cache(tmp_path / "nothing")
     with pytest.raises(RuntimeError, match="no cache to save"):
@@ -527,7 +524,7 @@ def test_loaded_cache_is_refused_in_another_scene_when_it_is_rendered(sphere, cu
 def test_xml_dictionary_and_render_calls_agree(sphere):
     xml = '<integrator type="nirc" version="3.0.0"><integer name="train_frames" value="10"/>\
         <integer name="train_samples" value="512"/><integer name="train_steps" value="0"/></integrator>'
-    from_xml, from_dict = mi.load_string(xml), nirc(train_frames=10)
+    from_xml, from_dict = mi.load_string(xml), mi.load_dict({**TRAINED, "train_frames": 10})
     assert str(from_xml).split("frames")[0] == str(from_dict).split("frames")[0]
     a = np.array(mi.render(sphere, integrator=from_xml, spp=4, seed=2))
     b = render(sphere, from_dict, 4, 2)
@@ -566,8 +563,6 @@ def test_render_leaves_gradients_of_the_caller_alone(sphere):
 # ---------------------------------------------------------------- films
 
 
-#: Left out of the default run
-SLOW_FILMS = ("gaussian", "box_border_crop", "luminance", "one_pixel", "wide")
 FILMS = {
     "crop": {"crop_offset_x": 3, "crop_offset_y": 5, "crop_width": 9, "crop_height": 6},
     "gaussian": {"rfilter": {"type": "gaussian"}},
@@ -578,23 +573,24 @@ FILMS = {
     "one_pixel": {"width": 1, "height": 1},
     "wide": {"width": 512, "height": 2},
 }
+FILMS["all"] = {**FILMS["crop"], **FILMS["border"], **FILMS["rgba"]}
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=SLOW) if n in SLOW_FILMS else n for n in FILMS])
+@pytest.mark.parametrize("name", sweep(FILMS, ("all",)))
 def test_film_shows_what_it_shows_with_path(mixed, name):
-    """Direct light, which both integrators give without bias. For `rgba` the coverage too."""
+    """Direct light, which both integrators give without bias. For `rgba` and `all` the coverage too."""
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, **FILMS[name]}
     to_world = mi.ScalarTransform4f().look_at([0, 3, 5], [0, 0.5, 0], [0, 1, 0])
     sensor = mi.load_dict({"type": "perspective", "fov": 60, "to_world": to_world, "film": film})
     images = []
     for type_, seed in (("nirc", 0), ("path", 100)):
-        integrator = mi.load_dict({"type": type_, "max_depth": 2, "hide_emitters": name == "rgba"})
+        integrator = mi.load_dict({"type": type_, "max_depth": 2, "hide_emitters": name in ("rgba", "all")})
         images.append([np.array(mi.render(mixed, sensor=sensor, integrator=integrator, spp=32, seed=seed + k))
                        for k in range(10)])  # fmt: skip
     ours, path = np.array(images, dtype=np.float64)
     assert ours.shape == path.shape and np.isfinite(ours).all()
     blocks = 1 if name == "one_pixel" else (2 if name == "wide" else 3)
-    if name == "rgba":
+    if name in ("rgba", "all"):
         assert_same_mean(ours[..., 3:], path[..., 3:], "alpha", blocks, relative=1e-5)
     assert_same_mean(ours[..., :3], path[..., :3], name, blocks, relative=1e-5)
 
@@ -616,7 +612,7 @@ SENSORS = {
 }
 
 
-@pytest.mark.parametrize("name", ["thin_lens", "shutter", pytest.param("orthographic", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", sweep(SENSORS, ("thin_lens",)))
 def test_every_kind_of_sensor_renders(mixed, name):
     to_world = mi.ScalarTransform4f().look_at([0, 3, 5], [0, 0.5, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}

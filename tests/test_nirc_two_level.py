@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import sweep
 from expectation import assert_same_mean, renders
 from two_level_bench import (
     CACHES,
@@ -61,7 +62,7 @@ def trained(bench):
 # ---------------------------------------------------------------- the mean is that of path
 
 
-@pytest.mark.parametrize("kind", ["trained", "nonsense", *(pytest.param(k, marks=SLOW) for k in CACHES[1::2])])
+@pytest.mark.parametrize("kind", sweep(CACHES, ("trained",)))
 def test_mean_is_that_of_path_for_any_cache(bench, kind):
     """Of the whole image to better than 1 %."""
     bench.check("cornell_box", kind, chosen("paper", "cell"), visible=0.01, spp=3 * SPP)
@@ -72,7 +73,7 @@ def test_mean_is_that_of_path_for_any_division(bench, kind):
     bench.check("cornell_box", kind, chosen("quarter", "several"))
 
 
-@pytest.mark.parametrize("kind", ["nonsense", *(pytest.param(k, marks=SLOW) for k in CACHES if k != "nonsense")])
+@pytest.mark.parametrize("kind", sweep(CACHES, ("nonsense",)))
 def test_mean_in_the_sphere_is_that_of_path(bench, kind):
     bench.check("point_lit_sphere", kind, chosen("paper", "quarter"))
 
@@ -317,7 +318,7 @@ def test_cache_of_no_one_or_of_other_sizes_is_not_shared(box):
         two_level().share_cache(nirc())
     with pytest.raises(ValueError, match=r"share_cache.*trained cache"):
         two_level().share_cache(mi.load_dict({"type": "path"}))
-    wide = nirc(width=16)
+    wide = nirc(width=24)
     wide.train(box, 1)
     with pytest.raises(ValueError, match="same sizes"):
         two_level().share_cache(wide)
@@ -339,7 +340,7 @@ def test_cache_files_of_either_are_read_by_both(box, tmp_path):
     found, known = again.cache.field.snapshot(), unbiased.cache.field.snapshot()
     assert all((found[k] == known[k]).all() for k in known)
     with pytest.raises(CacheFileError, match="same sizes"):
-        two_level(width=16).load_cache(tmp_path / "unbiased")
+        two_level(width=8).load_cache(tmp_path / "unbiased")
 
 
 # ---------------------------------------------------------------- state, films, passes

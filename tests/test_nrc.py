@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW, sweep
 from expectation import assert_mean, assert_same_mean, renders
 from test_incident import load
 from test_jit import recordings
@@ -27,9 +28,9 @@ from mi_neural.estimators.spread import PathSpread, camera_spread
 from mi_neural.render.sampling import PathSampler
 from mi_neural.render.surface import Roughened, surface_of
 
-SLOW = pytest.mark.slow  # more of what the default run shows at one value
-#: A cache that is trained in a second.
-SMALL = {"type": "nrc", "train_samples": 512, "train_frames": 60, "train_steps": 0}
+#: Trained in a second.
+TRAINED = {"type": "nrc", "train_samples": 512, "train_frames": 60, "train_steps": 0}
+SMALL = {**TRAINED, **NETWORK}
 #: What a surface of albedo 1/2 reflects in the point-lit sphere, where all light is 1 and half of it direct.
 REFLECTED = {"reflected": 1.0, "indirect": 0.5}
 
@@ -89,7 +90,7 @@ def constant_field(value: float) -> OutgoingField:
 def test_known_answer_within_two_percent(name, keys):
     """Emission or direct light lost or counted twice at any vertex is off by an eighth or more."""
     scene, _ = load(name)
-    integrator = nrc(train_samples=1024, **keys)
+    integrator = mi.load_dict({**TRAINED, "train_samples": 1024, **keys})  # with the default network
     image = render(scene, integrator, 64)
     print(f"{name}, {keys}: mean {image.mean():.4f} (known 1)")
     assert integrator.cache.steps == 60 and integrator.statistics()["recoveries"] == 0
@@ -112,7 +113,9 @@ def test_right_cache_gives_the_right_image(sphere, keys):
     assert_mean(images.mean(axis=(1, 2, 3)), 1, str(keys), relative=1e-5)
 
 
-@pytest.mark.parametrize("depth, known", [(0, 0), (1, 0.5), (2, 0.75), (3, 0.875), (-1, 1)])
+@pytest.mark.parametrize("depth, known", sweep(
+    [(0, 0), (1, 0.5), (2, 0.75), (3, 0.875), (-1, 1)], [(0, 0), (1, 0.5), (3, 0.875)]
+))  # fmt: skip
 def test_without_cache_the_lit_cube_has_the_radiance_of_its_depth(cube, depth, known):
     image = render(cube, nrc(spread_threshold=math.inf, max_depth=depth), 256)
     print(f"depth {depth}: {image.mean():.5f}, known {known}")
@@ -143,8 +146,10 @@ def test_image_scales_with_the_light(light):
 # ---------------------------------------------------------------- limit cases
 
 
-@pytest.mark.parametrize("keys", [{"max_depth": -1}, {"max_depth": 3, "hide_emitters": True},
-                                  pytest.param({"max_depth": 5}, marks=SLOW)], ids=str)  # fmt: skip
+@pytest.mark.parametrize("keys", sweep(
+    ({"max_depth": -1}, {"max_depth": 5}, {"max_depth": 3, "hide_emitters": True}),
+    ({"max_depth": 3, "hide_emitters": True},),
+), ids=str)  # fmt: skip
 def test_path_that_never_stops_is_path(mixed, keys):
     integrator = nrc(spread_threshold=math.inf, **keys)
     ours = renders(mixed, integrator, 24, 32)
@@ -162,7 +167,9 @@ def test_up_to_depth_two_it_is_path(mixed):
     assert integrator.cache.steps == 0
 
 
-@pytest.mark.parametrize("sampler", ["tree_lights", "power_lights", pytest.param("uniform_lights", marks=SLOW)])
+@pytest.mark.parametrize("sampler", sweep(
+    ("tree_lights", "power_lights", "uniform_lights"), ("tree_lights",)
+))  # fmt: skip
 def test_nested_light_sampler_leaves_the_mean(mixed, sampler):
     """The lights are chosen otherwise, by the training paths too."""
     image = render(mixed, nrc(light_sampler={"type": sampler}), 64)
@@ -369,7 +376,7 @@ def two_rooms() -> mi.Scene:
     return mi.load_dict({"type": "scene", **parts})
 
 
-@pytest.mark.parametrize("keys", [{"learning_rate": 0.03}, {}], ids=["slow", "default"])
+@pytest.mark.parametrize("keys", [{"learning_rate": 0.03}, pytest.param({}, marks=SLOW)], ids=["rate 0.03", "default"])
 def test_what_leaves_the_view_is_not_forgotten(keys):
     """Trained in one room, then in the other, then asked in the first: world-space records keep it.
 
@@ -516,7 +523,7 @@ def test_saved_cache_gives_the_same_image(sphere, cube, trained, tmp_path):
     with pytest.raises(CacheFileError, match="another scene"):
         nrc().load_cache(tmp_path / "c", cube)
     with pytest.raises(CacheFileError, match="same sizes"):
-        nrc(width=16).load_cache(tmp_path / "c")
+        nrc(width=8).load_cache(tmp_path / "c")
     with pytest.raises(CacheFileError, match="set cache_content to reflected"):
         nrc(cache_content="indirect").load_cache(tmp_path / "c")
     with pytest.raises(CacheFileError, match="no outgoing radiance"):

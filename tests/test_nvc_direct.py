@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import SLOW, sweep
 from expectation import assert_same_mean, renders
 from test_vertex import lights, test_scene
 
@@ -98,7 +99,7 @@ def unshadowed_and_monte_carlo(material: dict, lamp: dict, n: int = 256, m: int 
     return np.array(ours, np.float64), total
 
 
-@pytest.mark.parametrize("material, form, mean, each", [
+@pytest.mark.parametrize("material, form, mean, each", sweep([
     # Bounds on the error of the sum, and on the mean error over the mean; 1 % (sky: 3 %) is the noise of the reference
     *[("diffuse", form, 0.01, 0.02) for form in ("rectangle", "disk", "sphere")], ("diffuse", "constant", 0.01, 0.04),
     ("diffuse", "cylinder", 0.03, 0.1),
@@ -107,7 +108,11 @@ def unshadowed_and_monte_carlo(material: dict, lamp: dict, n: int = 256, m: int 
     ("roughplastic", "rectangle", 0.1, 0.1), ("roughplastic", "constant", 0.05, 0.07),
     ("gold", "rectangle", 0.05, 0.18), ("gold", "sphere", 0.05, 0.18), ("gold", "constant", 0.03, 0.07),
     ("beckmann", "rectangle", 0.1, 0.4), ("principled", "rectangle", 0.03, 0.05),
-])  # fmt: skip
+], [("diffuse", "disk", 0.01, 0.02), ("diffuse", "sphere", 0.01, 0.02), ("diffuse", "cylinder", 0.03, 0.1),
+    ("gold", "point", 1e-4, 1e-4), ("diffuse", "spot", 1e-4, 1e-4), ("gold", "directional", 1e-4, 1e-4),
+    ("twosided", "rectangle", 0.01, 0.02), ("plastic", "constant", 0.02, 0.05), ("roughplastic", "rectangle", 0.1, 0.1),
+    ("gold", "rectangle", 0.05, 0.18), ("beckmann", "rectangle", 0.1, 0.4),
+    ("principled", "rectangle", 0.03, 0.05)]))  # fmt: skip
 def test_unshadowed_light_is_that_of_monte_carlo(material, form, mean, each):
     ours, reference = unshadowed_and_monte_carlo(MATERIALS[material], FORMS[form])
     total, error = abs(ours.sum() / reference.sum() - 1), np.abs(ours - reference).mean() / reference.mean()
@@ -127,8 +132,9 @@ def many_lights():
 
 @pytest.mark.parametrize("keys", [
     {"light_sampler": nvc()}, {"light_sampler": nvc(freeze=True), "light_samples": 2},
-    {"light_sampler": nvc(outputs=2)}, {"light_sampler": nvc(outputs=2), "light_samples": 1},
-    {"light_sampler": {"type": "tree_lights"}}, {"light_sampler": {"type": "uniform_lights"}},
+    {"light_sampler": nvc(outputs=2)},
+    pytest.param({"light_sampler": nvc(outputs=2), "light_samples": 1}, marks=SLOW),
+    {"light_sampler": {"type": "tree_lights"}}, pytest.param({"light_sampler": {"type": "uniform_lights"}}, marks=SLOW),
 ], ids=["trained", "untrained, two shadow rays", "clusters", "clusters, one shadow ray", "tree_lights",
         "uniform_lights"])  # fmt: skip
 def test_sampled_has_the_mean_of_path(many_lights, keys):
@@ -217,8 +223,12 @@ def all_visible(integrator, scene) -> None:
     field.query = lambda x: [mi.Float(1)] * field.shape.n_outputs
 
 
-@pytest.mark.parametrize("material, tolerance", [("diffuse", 0.01), ("plastic", 0.02), ("gold", 0.06)])
-@pytest.mark.parametrize("forms", [["rectangle"], ["rectangle", "sphere", "disk", "point"]], ids=["one", "four"])
+@pytest.mark.parametrize("forms, material, tolerance", sweep(
+    [(forms, *case) for forms in (["rectangle"], ["rectangle", "sphere", "disk", "point"])
+     for case in (("diffuse", 0.01), ("plastic", 0.02), ("gold", 0.06))],
+    [(["rectangle"], "diffuse", 0.01), (["rectangle", "sphere", "disk", "point"], "plastic", 0.02),
+     (["rectangle", "sphere", "disk", "point"], "gold", 0.06)],
+))  # fmt: skip
 def test_neural_with_all_visible_is_path_where_nothing_casts_shadows(material, tolerance, forms):
     """Four lights at different places, out of the camera's sight."""
     lamps = {f: {**FORMS[f]} for f in forms}

@@ -5,7 +5,8 @@ import math
 
 import mitsuba as mi
 import pytest
-from two_level_bench import SLOW, SMALL, Bench, fill, render
+from cheap import SLOW, sweep
+from two_level_bench import SMALL, Bench, fill, render
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def pilot_at_once(monkeypatch):
     monkeypatch.setattr(importlib.import_module("mi_neural.integrators.pilot"), "WORTH", 0)
 
 
-def test_small_images_are_path_traced_and_measured_when_asked(box, monkeypatch):
+def test_small_images_are_path_traced_and_measured_when_asked(box, monkeypatch, short_pilot):
     monkeypatch.setattr(importlib.import_module("mi_neural.integrators.pilot"), "WORTH", 3 * 256)
     integrator = mi.load_dict({**SMALL, "train_frames": 4, "train_steps": 0})
     for k in range(2):
@@ -61,11 +62,11 @@ def clockwork(monkeypatch, short_pilot):
     return costs
 
 
-@pytest.mark.parametrize("given", [
-    {}, {"alpha": 1.0, "cache_samples": 2}, {"ris": True},
-    *(pytest.param(k, marks=SLOW) for k in ({"cache_samples": 3, "residual_samples": 3}, {"alpha": "cell"},
-                                            {"residual_probability": 0.3})),
-])  # fmt: skip
+@pytest.mark.parametrize("given", sweep(
+    [{}, {"alpha": 1.0, "cache_samples": 2}, {"ris": True}, {"cache_samples": 3, "residual_samples": 3},
+     {"alpha": "cell"}, {"residual_probability": 0.3}],
+    [{"alpha": 1.0, "cache_samples": 2}],
+))  # fmt: skip
 def test_chosen_division_stays_within_the_keys_given(box, short_pilot, given):
     integrator = mi.load_dict({**SMALL, "train_frames": 12, **given})
     image = render(box, integrator, 4)

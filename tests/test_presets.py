@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW
 from expectation import assert_mean, assert_same_mean, renders
 from test_vertex import LIGHTS, lights
 from test_vertex import test_scene as lit
@@ -62,7 +63,8 @@ def test_keys_go_before_the_preset_and_the_default_is_as_measured():
     assert chooses.floor == 0.06 and chooses.several is None and sampler.cache.steps == 32
 
 
-@pytest.mark.parametrize("keys", [{}, {"outputs": 2, "clusters": "kmeans"}], ids=["lights", "clusters"])
+@pytest.mark.parametrize("keys", [{}, pytest.param({"outputs": 2, "clusters": "kmeans"}, marks=SLOW)],
+                         ids=["lights", "clusters"])  # fmt: skip
 def test_image_is_that_of_path(keys):
     scene = lit(lights("all"), 12)
     sampler = {"type": "nvc_lights", "preset": "paper", **QUICK, **keys}
@@ -200,10 +202,13 @@ def test_default_of_incident_radiance_is_as_measured(kind):
 
 
 @pytest.mark.parametrize("keys", [
-    {"type": "nirc"}, {"type": "nirc", "termination": "spread"}, {"type": "nirc", "termination": "primary"},
-    {"type": "nirc", "blend": "reliability", "reliability_warm_up": 0}, {"type": "nirc", "blend": "fast"},
-    {"type": "nirc", "inputs": "normal"}, {"type": "nirc_two_level", "cache_samples": 2, "every_vertex": True},
-    {"type": "nirc_two_level", "mode": "progressive"}, {"type": "nirc_two_level", "ris": True, "cache_samples": 2},
+    {"type": "nirc"}, {"type": "nirc", "blend": "reliability", "reliability_warm_up": 0},
+    *(pytest.param({"type": "nirc", **keys}, marks=SLOW) for keys in (
+        {"termination": "spread"}, {"termination": "primary"}, {"blend": "fast"})),
+    pytest.param({"type": "nirc", "inputs": "normal"}, marks=SLOW),
+    {"type": "nirc_two_level", "cache_samples": 2, "every_vertex": True},
+    pytest.param({"type": "nirc_two_level", "mode": "progressive"}, marks=SLOW),
+    {"type": "nirc_two_level", "ris": True, "cache_samples": 2},
 ], ids=lambda keys: "-".join(str(v) for v in keys.values()))  # fmt: skip
 def test_incident_radiance_renders_with_the_preset(keys):
     """Materials of all kinds; the scene's mean has to be right to 20 % after so little training."""
@@ -336,7 +341,8 @@ def test_derivatives_do_not_go_through_inputs_of_the_network():
     scene, found = room(size=8), []
     params = mi.traverse(scene)
     for inputs in ("none", "albedo, roughness"):
-        integrator = mi.load_dict({"type": "nirc", "train_samples": 512, "train_frames": 60, "inputs": inputs})
+        integrator = mi.load_dict({"type": "nirc", "train_samples": 512, "train_frames": 60, "inputs": inputs,
+                                   **NETWORK})  # fmt: skip
         dr.enable_grad(params["white.brdf_0.reflectance.value"])
         params.update()
         dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=64)))

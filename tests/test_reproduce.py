@@ -7,12 +7,13 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK
 from typer.testing import CliRunner
 
 from mi_neural.bench import load
 from mi_neural.caches.reliability import Reliability, ReliabilityGrid
 from mi_neural.cli import app
-from mi_neural.reproduce import fsr, measures, registry, reliability, scene_files
+from mi_neural.reproduce import changed, fsr, measures, registry, reliability, scene_files
 from mi_neural.reproduce.changed import mean_reliabilities
 from mi_neural.reproduce.entry import SOURCES, Entry, Outcome, Statement
 from mi_neural.reproduce.work import Part, Work
@@ -100,6 +101,8 @@ def test_quick_counterpart_shows_both_numbers(tmp_path, monkeypatch):
     tiny = reliability.Settings((16, 16), frames=23, pretrain=2, spp=1, reference_spp=16, cache_samples=1,
                                 methods=("High-LR", "EMA", "blend"))  # fmt: skip
     monkeypatch.setattr(reliability, "QUICK", tiny)
+    for method in tiny.methods:
+        monkeypatch.setitem(changed.METHODS, method, changed.METHODS[method] | NETWORK)
     for name in ("fig1", "hidden", "fig4"):
         shown = run(f"reliability/{name}", "--quick", "-o", str(tmp_path))
         assert shown.exit_code == 0, shown.stderr

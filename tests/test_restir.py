@@ -82,7 +82,7 @@ def many_lights_path() -> np.ndarray:
 
 
 @pytest.mark.parametrize("keys", [
-    {}, {"candidates": "nvc"},
+    {}, pytest.param({"candidates": "nvc"}, marks=pytest.mark.slow),
     pytest.param({"candidates": "nvc", "nvc_where": "disoccluded"}, marks=pytest.mark.slow),
     pytest.param({**ALONE, "initial_candidates": 1}, marks=pytest.mark.slow),
     {"candidates": "nvc", "candidate_shadow_ray": False},

@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from two_level_bench import SLOW, Bench, render, split_of
+from cheap import NETWORK, SLOW, sweep
+from two_level_bench import Bench, render, split_of
 
 from mi_neural.caches import guide as guides
 from mi_neural.caches.outlook import ENTRIES, Outlook
@@ -154,12 +155,16 @@ def test_guide_of_a_room_looks_at_its_light(bench):
 # ---------------------------------------------------------------- the mean is that of path
 
 
+@pytest.mark.parametrize("kind, split", sweep(
+    [(kind, split) for kind in KINDS for split in SPLITS],
+    [("learned", "both"), ("broken", "with cache"), ("nonsense", "guided")],
+))  # fmt: skip
+def test_mean_is_that_of_path_whatever_is_expected(bench, kind, split):
+    check(bench, "cornell_box", kind, {split: SPLITS[split]})
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_mean_is_that_of_path_whatever_is_expected(bench, kind):
-    check(bench, "cornell_box", kind, SPLITS)
-
-
-@pytest.mark.parametrize("kind", ["learned", *(pytest.param(k, marks=SLOW) for k in KINDS[1:])])
 def test_mean_in_the_sphere_is_that_of_path(bench, kind):
     check(bench, "point_lit_sphere", kind, SPLITS)
 
@@ -203,7 +208,8 @@ def test_strength_is_measured_with_the_division(bench, monkeypatch):
     integrator = mi.load_dict({"type": "nirc_two_level", "alpha": 0.0, "cache_samples": 0, "roulette": 0.5})
     render(scene, integrator, 1)
     assert integrator.statistics()["split"] == "path tracing, 1 path, roulette 0.5"
-    integrator = mi.load_dict({"type": "nirc_two_level", "train_samples": 512, "train_frames": 2, "train_steps": 0})
+    integrator = mi.load_dict({"type": "nirc_two_level", "train_samples": 512, "train_frames": 2, "train_steps": 0,
+                               **NETWORK})  # fmt: skip
     render(scene, integrator, 1)
     strengths = {t["roulette"] for t in integrator.measure(scene)["pilot"]}
     assert 0 in strengths and len(strengths) == 4
@@ -222,6 +228,6 @@ def test_impossible_key_is_refused_by_name(key, value):
 
 def test_equal_seeds_give_equal_images(bench):
     scene = bench.scene("cornell_box")
-    images = [render(scene, mi.load_dict({"type": "nirc_two_level", "cache_samples": 0, **KEYS}), seed=3)
+    images = [render(scene, mi.load_dict({"type": "nirc_two_level", "cache_samples": 0, **NETWORK, **KEYS}), seed=3)
               for _ in range(2)]  # fmt: skip
     assert np.array_equal(*images)

@@ -5,6 +5,7 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK, SLOW
 from load_study import load_study
 from typer.testing import CliRunner
 
@@ -21,7 +22,7 @@ def passes(rng, n: int, spp: int, tail: float, size: int = 48):
     return known, [known * rng.gamma(shape, 1 / shape, known.shape) for _ in range(n)]
 
 
-@pytest.mark.parametrize("n, tail", [(8, 0.5), (40, 0.5), (40, 4.0)])
+@pytest.mark.parametrize("n, tail", [(8, 0.5), *(pytest.param(40, t, marks=SLOW) for t in (0.5, 4.0))])
 def test_true_error_lies_in_the_interval_as_often_as_it_says(n, tail):
     """300 images; the share that the interval holds is within four standard errors of what it says or more: a right one
     fails in less than one of 10,000 seeds. The estimate is within 3 % in the mean."""
@@ -62,7 +63,7 @@ def box():
 def test_rendering_ends_when_the_error_is_reached(box, kind, error):
     """By the true error it is neither missed by more than a fifth nor by twice as many samples as needed."""
     scene, known = box
-    keys = {} if kind == "path" else {"train_frames": 16, "train_samples": 512, "train_steps": 0}
+    keys = {} if kind == "path" else {"train_frames": 16, "train_samples": 512, "train_steps": 0, **NETWORK}
     integrator = mi.load_dict({"type": kind, "max_depth": 8, **keys})
     rendered, estimate = budget.render_until(scene, integrator, error)
     true = metrics.relmse_trimmed(rendered.rgb, known)

@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import sweep
 from expectation import assert_same_mean, renders
 
 SAMPLERS = {
@@ -48,8 +49,11 @@ def room() -> mi.Scene:
     })  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant, name", sweep(
+    [(variant, name) for variant in VARIANTS for name in SAMPLERS],
+    [("llvm_ad_mono", name) for name in ("none", "power", "cells")] +
+    [("llvm_ad_spectral", name) for name in ("none", "tree")],
+))  # fmt: skip
 def test_image_is_that_of_path(variant, name):
     mi.set_variant(variant)
     scene = room()

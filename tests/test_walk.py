@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK
 
 TINTS = (5, 1, 1), (1, 1, 8), (1, 6, 1), (4, 4, 1), (3, 1, 5)
 KINDS = {"nirc": {"type": "nirc"}, "nrc": {"type": "nrc"}, "auto": {"type": "nrc", "termination": "auto"}}
@@ -31,13 +32,13 @@ def rooms(n: int):
             f"left{k}": wall(at(-1, 0, 0), (0, 1, 0), 90), f"right{k}": wall(at(1, 0, 0), (0, 1, 0), -90),
             f"lamp{k}": wall(at(0, 0.98, 0), (1, 0, 0), 90, 0.3, emitter=light, bsdf=black),
             f"view{k}": {"type": "perspective", "fov": 80, "to_world": view,
-                         "film": {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}},
+                         "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}},
         }  # fmt: skip
     return mi.load_dict(scene)
 
 
 def make(kind: str):
-    return mi.load_dict({**KINDS[kind], "train_samples": 1024})
+    return mi.load_dict({**KINDS[kind], "train_samples": 1024, **NETWORK})
 
 
 def errors(integrator, scene, room: int, truth) -> tuple[float, float]:

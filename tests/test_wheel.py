@@ -103,7 +103,7 @@ def test_the_shipped_reference_is_found(installed):
     assert Path(shown.strip()) == target / "mi_neural/scenes/ajar_door_reference_320x180.exr"
 
 
-@pytest.mark.parametrize("page", ["neural_path", "nvc_lights", "speed"])
+@pytest.mark.parametrize("page", [pytest.param("neural_path", marks=pytest.mark.slow), "nvc_lights", "speed"])
 def test_pages_of_the_manual_are_shown_by_the_program(installed, page):
     _, target = installed
     shown = run(target / "bin/mi-neural", "doc", page, folder=target.parent, PYTHONPATH=str(target))

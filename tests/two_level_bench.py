@@ -7,13 +7,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cheap import NETWORK
 from expectation import assert_same_mean, renders
 
 from mi_neural import scenes
 
 SLOW = pytest.mark.slow
-#: A cache that is trained in a second, and a division that is all given, so that nothing is measured.
-SMALL = {"type": "nirc_two_level", "train_samples": 512, "train_frames": 60, "train_steps": 0, "hide_emitters": True}
+#: A cache that is trained in half a second, and a division that is all given, so that nothing is measured.
+SMALL = {"type": "nirc_two_level", "train_samples": 512, "train_frames": 60, "train_steps": 0, "hide_emitters": True,
+         **NETWORK}  # fmt: skip
 GIVEN = {"cache_samples": 4, "residual_samples": 1, "residual_probability": 1.0, "alpha": "cell"}
 N_RENDERS, SPP = 64, 16
 #: z-tests of this module that are corrected for, the slow ones included.
