@@ -19,18 +19,13 @@ from mi_neural.render.frozen import locked
 from mi_neural.render.kernels import end_kernel
 from mi_neural.render.surface import scene_is_glossy
 
-#: Queries a camera sample, at its first surface and at its end.
-QUERIES = 2.0
-#: A denoiser removes as much noise as so many times the samples, and its images of few samples have the least FLIP with
-#: this spread threshold (manual, measured).
-DENOISED_SAMPLES, DENOISED_THRESHOLD = 100, 1.0
+#: Queries a camera sample, at its first surface and at its end; of an image that will be denoised at the end alone.
+QUERIES, QUERIES_DENOISED = 2.0, 1.0
 #: Share of its training paths that run on without self-training. Of a denoised image of 32 samples, FLIP over that with
 #: a quarter: veach-bidir 0.89, veach-ajar, living room and staircase 0.99, Cornell box 1.04 (manual, measured).
 DENOISED_UNBOUNDED = 0.5
-#: Ratio b²/v from which on the spread threshold of an image that will be denoised is the largest.
-LARGE_RATIO = 0.02
-#: Constant of :func:`young_threshold`, in training steps.
-YOUNG = 120.0
+#: Constants of :func:`denoised_threshold`: the factor of N b², and training steps.
+ENDS, YOUNG = 0.3, 60.0
 #: A cache that is trained by time stays out of images until it has so many steps. Denoised images of 16 samples have
 #: over the squared error of `path` after 5, 10, 20, 40, 80 steps: veach-ajar 4.4 to 8.2, 2.5 to 8.4, 1.5 to 1.8, 0.7 to
 #: 2.0, 0.5 to 0.6; living room 1.1 to 1.2, 0.9, 0.8 to 0.9, 0.8, 0.8; Cornell box 1.1, 0.6, 0.6, 0.6, 0.5 (manual,
@@ -40,32 +35,22 @@ LEAST_STEPS = 24
 LONGER = 1.4
 
 
-def denoised_threshold(ratio, spp):
-    """Spread threshold of an image of `spp` samples that will be denoised: ``sqrt(spp) min(1, (ratio / 0.02)²)``.
+def denoised_threshold(mean_bias, steps, spp):
+    """Spread threshold of an image of `spp` samples that will be denoised, by a cache of so many training `steps`: the
+    larger one of ``0.3 spp b²`` and, which counts after few steps, ``(spp b² (60 / steps)^4)^1.5``.
 
-    `ratio` is b²/v, the cache's squared bias over the noise of tracing on. Form and number fit the best of up to
-    five thresholds (1 to 100) in six scenes, with 4, 16 and 64 samples (studies/spread_threshold.py).
+    `mean_bias` is b², the cache's squared bias. With `spp` times as little noise as one sample has, a bias counts `spp`
+    times as much. Form and numbers fit six scenes after 40 and 150 steps, with 4, 16 and 48 samples
+    (studies/spread_threshold.py).
     """
-    return dr.sqrt(spp) * dr.minimum(1, dr.square(ratio / LARGE_RATIO))
-
-
-def young_threshold(mean_bias, steps, spp):
-    """Spread threshold of an image of `spp` samples that will be denoised, by a cache of so many training `steps`:
-    ``(spp b² (120 / steps)^4)^1.5``.
-
-    `mean_bias` is b², the cache's squared bias. Form and number fit six scenes after 8 to 300 steps, with 4 to 64
-    samples and thresholds of 0.1 to 4096 (manual, measured).
-    """
-    expected = spp * mean_bias * dr.square(dr.square(YOUNG / steps))
-    return expected * dr.sqrt(expected)
+    young = spp * mean_bias * dr.square(dr.square(YOUNG / steps))
+    return dr.maximum(ENDS * spp * mean_bias, young * dr.sqrt(young))
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
     def __init__(self, props):
         super().__init__(props)
         self.denoised = props.get("denoised", False)
-        if self.denoised and "spread_threshold" not in props:
-            self.spread_threshold = DENOISED_THRESHOLD
         n = self.cache.training.n_paths
         self._check(n > 1, f"train_samples is {n}; training paths come in pairs, at least 2")
         self.cache = MeasuredCache(self.outgoing_training(), OutgoingShape.like(self.cache.shape), self.seed)
@@ -82,7 +67,7 @@ class NeuralPathIntegrator(OutgoingIntegrator):
 
     @property
     def queries_per_sample(self) -> float:
-        return QUERIES if self.needs_cache else 0.0
+        return (QUERIES_DENOISED if self.denoised else QUERIES) if self.needs_cache else 0.0
 
     @property
     def left_out(self) -> bool:
@@ -118,11 +103,10 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         return super().statistics() | ({"cache_left_out": True} if self.left_out else {})
 
     def settings(self, spp: int) -> tuple:
-        """Samples that the noise is averaged over, the spread threshold, and training steps of the cache."""
+        """Samples of the finished image, the spread threshold, and training steps of the cache."""
         if self.left_out:
-            return math.inf, math.inf, 1
-        samples = float(spp) * (DENOISED_SAMPLES if self.denoised else 1)
-        return samples, grown(self.spread_threshold, spp), max(1, self.cache.steps)
+            return (1.0 if self.denoised else math.inf), math.inf, 1
+        return float(spp), grown(self.spread_threshold, spp), max(1, self.cache.steps)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -130,43 +114,44 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         """E[L] = Le + w L_o(x_1) + (1 - w) [direct light + what a path gathers that ends in the cache when it is wide].
 
         `field`: a :class:`~mi_neural.caches.accuracy.MeasuredField`; None: path tracing. The share w depends on nothing
-        but the place and the number of samples of the finished image.
+        but the place and the number of samples of the finished image, and is 0 for an image that will be denoised.
         """
-        n_samples, threshold, steps = settings
+        spp, threshold, steps = settings
         cached, glossy = self.needs_cache and field is not None, scene_is_glossy(scene)
+        shows = bool({"cache", "density"} & set(self.channels))
+        mixes = cached and not self.denoised
         if cached and self.denoised:
-            spp = n_samples / DENOISED_SAMPLES
-            threshold = dr.maximum(threshold, denoised_threshold(field.grid.ratio, spp))
-            young = young_threshold(field.grid.mean_bias, steps, spp)
-            threshold, n_samples = dr.maximum(threshold, young), n_samples * (1 + young)
+            threshold = dr.maximum(threshold, denoised_threshold(field.grid.mean_bias, steps, spp))
 
         def stop(path, spread, smooth, first, sampler):
-            share = field.grid.share(*self.walk.place(path), n_samples, smooth)
+            share = field.grid.share(*self.walk.place(path), spp, smooth) if mixes else mi.Float(0)
             return share, smooth & ~first & spread.exceeds(threshold), mi.Bool(False), sampler
 
+        looks = mixes or (cached and shows)
         end, sampler = prefix.trace(
-            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=cached, walk=self.walk
+            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=looks, walk=self.walk
         )
         path, zero = end.path, mi.Color3f(0)
         channels = {"traced": path.L, "cached": zero, "cache": zero, "density": mi.Float(0),
                     "depth": dr.select(path.valid, mi.Float(path.depth), 0),
-                    "share": end.share if cached else mi.Float(0)}  # fmt: skip
+                    "share": end.share if mixes else mi.Float(0)}  # fmt: skip
         if not cached:
             return path.L, path.valid, channels
 
         def query(active, surface):
             return mi.Color3f(*where_active(active, surface.inputs(), lambda *inputs: tuple(field.query(*inputs)), 3))
 
-        shows = bool({"cache", "density"} & set(self.channels))
-        seen = (dr.max(end.β_first) > 0) & ((end.share > 0) | shows)
         last = self.walk.surface(path, end.ends, glossy)
-        end_kernel(path.L, path.β, path.valid, path.depth, end.ends, end.share, end.β_first, end.first, last)
-        at_first = end.β_first * query(seen, end.first)
-        at_end = path.β * query(end.ends, last)
-        cached = end.share * at_first + dr.select(end.ends, at_end, 0)
-        channels |= {"cached": cached, "cache": at_first}
+        first = [end.share, end.β_first, end.first] if looks else []
+        end_kernel(path.L, path.β, path.valid, path.depth, end.ends, last, *first)
+        cached = dr.select(end.ends, path.β * query(end.ends, last), 0)
+        if looks:
+            seen = (dr.max(end.β_first) > 0) & ((end.share > 0) | shows)
+            channels["cache"] = end.β_first * query(seen, end.first)
+            cached += end.share * channels["cache"]
         if shows:
             channels["density"] = dr.select(seen, field.field.density_at(end.first.position), 0)
+        channels["cached"] = cached
         return path.L + cached, path.valid, channels
 
     def to_string(self):
@@ -210,9 +195,9 @@ NeuralPathIntegrator.__doc__ = (
 
      * - denoised
        - |bool|
-       - The image will be denoised: noise counts as in 100 times as many samples, ``spread_threshold`` is 1, and is
-         raised to :math:`\sqrt{N} \min(1, (b^2/0.02 v)^2)` and, after few training steps t, to
-         :math:`(N b^2 (120/t)^4)^{3/2}` where that is more, b² and v being means of the scene. (Default: false)
+       - The image will be denoised: the first surface does not show the cache, and ``spread_threshold`` is raised to
+         :math:`0.3 N b^2` and, after few training steps t, to :math:`(N b^2 (60/t)^4)^{3/2}` where that is more, b²
+         being the mean of the scene. (Default: false)
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where

@@ -1,6 +1,6 @@
 """Which spread threshold a denoised image of `neural_path` wants, by its samples a pixel.
 
-    python studies/spread_threshold.py SCENE.xml REFERENCE.exr [--frames 400] [--spp 16,64] [--thresholds 1,4,16,64]
+    python studies/spread_threshold.py SCENE.xml REFERENCE.exr [--frames 400] [--spp 16,64] [--thresholds 0.1,1,8,64]
 
 One cache is trained for so many frames. With it, for each threshold c and number of samples, one image is rendered and
 denoised. A line says: the processor's seconds of rendering, trimmed relMSE, FLIP against the reference, and FLIP
@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 
-def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", thresholds: str = "1,4,16,64",
+def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", thresholds: str = "0.1,1,8,64",
          max_depth: Annotated[int, typer.Option()] = 64) -> None:  # fmt: skip
     import mitsuba as mi
 
@@ -26,7 +26,7 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     mi.set_variant("llvm_ad_rgb")
     from mi_neural.bench import budget, load
     from mi_neural.image import exr, metrics
-    from mi_neural.integrators.neural_path import DENOISED_SAMPLES, denoised_threshold
+    from mi_neural.integrators.neural_path import denoised_threshold
 
     exact = exr.read(reference)
     loaded = load.load_scene(str(scene), [exact.size], {})
@@ -48,13 +48,13 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     ours, _ = load.build_integrator(load.parse_integrator("neural_path:denoised=true"), {"max_depth": max_depth})
     budget.train(loaded.scene, ours, frames)
     ours.freeze_cache = True
-    ratio, spps = ours.cache.queried.grid.ratio[0], [int(n) for n in spp.split(",")]
-    ours.denoised = False  # or it would raise the thresholds by what it has measured
+    bias, spps = ours.cache.queried.grid.mean_bias[0], [int(n) for n in spp.split(",")]
+    ours.cache.queried.grid.mean_bias = mi.Float(0)  # or it would raise the thresholds by what it has measured
     for samples in spps:
-        print(f"{loaded.name}, {samples} spp: neural_path takes c = {max(1.0, denoised_threshold(ratio, samples)):.1f}")
+        print(f"{loaded.name}, {samples} spp: neural_path takes c = {denoised_threshold(bias, frames, samples):.2g}")
         line("path", path, samples)
         for c in map(float, thresholds.split(",")):
-            ours.settings = lambda n, c=c: (n * DENOISED_SAMPLES, c)
+            ours.settings = lambda n, c=c: (n, c, frames)
             line(f"c = {c:g}", ours, samples)
 
 

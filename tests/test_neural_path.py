@@ -23,7 +23,7 @@ from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
 from mi_neural.estimators.spread import grown
-from mi_neural.integrators.neural_path import DENOISED_SAMPLES, LEAST_STEPS, YOUNG, denoised_threshold, young_threshold
+from mi_neural.integrators.neural_path import ENDS, LEAST_STEPS, YOUNG, denoised_threshold
 from mi_neural.render.kernels import on_gpu
 
 #: Caches that are trained in a second.
@@ -60,10 +60,10 @@ def trained(box):
     return integrator
 
 
-def force(integrator, noise=1.0, bias=1e9, ratio=0.0, mean_bias=0.0) -> None:
+def force(integrator, noise=1.0, bias=1e9, mean_bias=0.0) -> None:
     """Let the grid of a trained integrator say the same everywhere."""
     grid = integrator.cache.queried.grid
-    grid.ratio, grid.mean_bias = mi.Float(ratio), mi.Float(mean_bias)
+    grid.mean_bias = mi.Float(mean_bias)
     grid.noise, grid.bias = (dr.full(mi.Float, v, grid.constants.n_entries) for v in (noise, bias))
     dr.make_opaque(grid)
 
@@ -154,26 +154,26 @@ def test_values_that_are_not_finite_or_huge_spoil_nothing(rng):
     assert all(np.isfinite(v).all() for v in grid.arrays().values())
 
 
-def test_ratio_is_squared_bias_over_noise(rng):
-    """Of 2^18 pairs: 0.04 over 0.25, within four standard errors of about 1 %."""
+def test_mean_bias_is_that_of_all_pairs(rng):
+    """Of 2^18 pairs: 0.25² over 1.25² + 0.01, within four standard errors of about 1 %."""
     grid = Accuracy(*BOX)
-    assert float(grid.ratio[0]) == float(grid.mean_bias[0]) == 0
-    observe(grid, pairs(rng, 2**18, 0.25, 0.625))  # over a prediction that is 1.25 of the truth
-    assert float(grid.ratio[0]) == pytest.approx(0.04 / 0.25, rel=0.04)
+    assert float(grid.mean_bias[0]) == 0
+    observe(grid, pairs(rng, 2**18, 0.25, 0.625))
+    assert float(grid.mean_bias[0]) == pytest.approx(0.25**2 / (1.25**2 + 1e-2), rel=0.04)
     assert float(grid.mean_bias[0]) == pytest.approx(grid.summary()["bias_of_pairs"], rel=1e-4)
     grid.reset()
-    assert float(grid.ratio[0]) == float(grid.mean_bias[0]) == 0
+    assert float(grid.mean_bias[0]) == 0
 
 
 def test_threshold_of_denoised_images_grows_with_samples_and_with_what_is_wrong():
-    assert denoised_threshold(0.0, 64) == 0 and denoised_threshold(0.02, 64) == denoised_threshold(5.0, 64) == 8
-    assert denoised_threshold(0.01, 64) == pytest.approx(2) and denoised_threshold(0.01, 16) == pytest.approx(1)
+    assert denoised_threshold(0.0, 1e3, 64) == 0 and denoised_threshold(0.02, 1e3, 64) == pytest.approx(ENDS * 1.28)
+    assert denoised_threshold(0.01, 1e3, 64) == denoised_threshold(0.02, 1e3, 32) == pytest.approx(ENDS * 0.64)
 
 
 def test_threshold_of_denoised_images_is_higher_after_few_steps():
-    assert young_threshold(0.05, YOUNG, 20) == pytest.approx(1)
-    assert young_threshold(0.05, YOUNG / 2, 20) == pytest.approx(2**6)
-    assert young_threshold(0.2, YOUNG, 20) == young_threshold(0.05, YOUNG, 80) == pytest.approx(8)
+    assert denoised_threshold(0.05, YOUNG, 20) == pytest.approx(1)
+    assert denoised_threshold(0.05, YOUNG / 2, 20) == pytest.approx(2**6)
+    assert denoised_threshold(0.2, YOUNG, 20) == denoised_threshold(0.05, YOUNG, 80) == pytest.approx(8)
 
 
 def test_grid_is_kept_restored_and_forgotten(rng):
@@ -181,7 +181,7 @@ def test_grid_is_kept_restored_and_forgotten(rng):
     empty = grid.arrays()
     observe(grid, pairs(rng, 4096, 0.1, 1.0))
     other.set_arrays(grid.arrays())
-    assert float(grid.ratio[0]) == float(other.ratio[0]) > 0
+    assert float(grid.mean_bias[0]) == float(other.mean_bias[0]) > 0
     np.testing.assert_array_equal(np.array(other.bias), np.array(grid.bias))
     np.testing.assert_array_equal(np.array(other.noise), np.array(grid.noise))
     grid.reset()
@@ -268,9 +268,9 @@ def test_denoised_images_learn_from_more_paths_without_an_end():
 @pytest.mark.parametrize("denoised", [pytest.param(False, marks=SLOW), True])
 def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
-    force(integrator, ratio=0.02)
+    force(integrator, mean_bias=0.6)
     ours = renders(box, integrator, 24, 32)
-    c = denoised_threshold(0.02, 32) if denoised else grown(0.01, 32)
+    c = denoised_threshold(0.6, trained.cache.steps, 32) if denoised else grown(0.01, 32)
     assert (c > 5) == denoised
     known = renders(box, outgoing_alone(trained, box, spread_threshold=c), 24, 32, first_seed=1000)
     assert_same_mean(ours, known, f"nrc, c = {c}", relative=1e-5)
@@ -332,17 +332,20 @@ def test_share_falls_as_samples_grow_and_channels_say_so(trained, box):
     assert shares[0] > shares[1] > shares[2] and depths[0] < depths[2]
 
 
-def test_denoised_counts_noise_less(trained, box, tmp_path):
-    """As in so many more samples, and paths are traced further before they end."""
+@pytest.mark.parametrize("channels", ["share, depth", "share, depth, cache"])
+def test_denoised_images_do_not_show_the_cache_at_the_first_surface(trained, box, tmp_path, channels):
+    """Also where the cache is seen in a channel; and paths are traced further before they end."""
     found = {}
     for denoised in (False, True):
-        integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels="share, depth")
-        found[denoised] = render(box, integrator, 4)[..., 3:].mean(axis=(0, 1))
-    n, c, steps = auto(denoised=True).settings(4)
-    assert n == 4 * DENOISED_SAMPLES and c == 1.0 and steps == 1 and auto(denoised=True).settings(512)[1] == 2.0
-    assert auto(denoised=True, spread_threshold=0.1).settings(4)[1] == 0.1
+        integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels=channels)
+        force(integrator, bias=1.0, mean_bias=4.0)
+        image = render(box, integrator, 4)
+        found[denoised] = image[..., 3:5].mean(axis=(0, 1))
+        assert image[..., 5:].max(initial=1) > 0
+    assert auto(denoised=True).settings(2) == (2, 0.01, 1) and auto(denoised=True).settings(512)[1] == 2.0
     print(f"(share, depth): {found[False]}, denoised {found[True]}")
-    assert found[True][0] < 0.5 * found[False][0] and found[True][1] > found[False][1]
+    assert found[True][0] == 0 < found[False][0] and found[True][1] > found[False][1]
+    assert integrator.queries_per_sample < copy_of(trained, box, tmp_path).queries_per_sample
 
 
 def test_young_cache_is_traced_past_in_denoised_images(box):

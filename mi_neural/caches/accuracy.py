@@ -65,13 +65,13 @@ class Accuracy:
 
     Squared errors are relative to the squared prediction of the cache. Cells split by the main axis of the normal. Per
     entry: `noise` v and `bias` b² (empty cells hold the mean of all, an empty grid 0: no share). `mean_bias`: the mean
-    b² of all pairs, and `ratio`: that over their mean v, both 0 for an empty grid. `n_pairs`: decayed count of all
-    pairs; `squares`: decayed sum of the squared single biases.
+    b² of all pairs, 0 for an empty grid. `n_pairs`: decayed count of all pairs; `squares`: decayed sum of the squared
+    single biases.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
         "voxels": object, "scale": object, "sums": object, "n_pairs": object, "squares": object, "noise": object,
-        "bias": object, "mean_bias": object, "ratio": object,
+        "bias": object, "mean_bias": object,
     }  # fmt: skip
 
     def __init__(self, box_min, box_max, constants: AccuracyShape | None = None, *, scale: float = 1.0):
@@ -134,7 +134,6 @@ class Accuracy:
         inv_all = dr.select(self.n_pairs > 0, 1 / dr.maximum(self.n_pairs, 1e-3), 0)
         noise_of_all, bias_of_all = dr.sum(noise), dr.sum(bias)
         self.mean_bias = dr.maximum(bias_of_all, 0) * inv_all
-        self.ratio = dr.select(noise_of_all > 0, dr.maximum(bias_of_all, 0) / dr.maximum(noise_of_all, 1e-20), 0)
         self.noise = (noise + PRIOR * noise_of_all * inv_all) / (n + PRIOR)
         variance = self.squares * inv_all
         # A squared bias counts at least as its mean's standard error: what is not known is not trusted
