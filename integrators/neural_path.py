@@ -24,8 +24,8 @@ QUERIES, QUERIES_DENOISED = 2.0, 1.0
 #: Share of its training paths that run on without self-training. Of a denoised image of 32 samples, FLIP over that with
 #: a quarter: veach-bidir 0.89, veach-ajar, living room and staircase 0.99, Cornell box 1.04 (manual, measured).
 DENOISED_UNBOUNDED = 0.5
-#: Constants of :func:`denoised_threshold`: the factor of N b², and training steps.
-ENDS, YOUNG = 0.3, 60.0
+#: Constants of :func:`denoised_threshold`: the factor of N b², training steps, and the least b² that is believed.
+ENDS, YOUNG, LEAST_BIAS = 0.3, 60.0, 1e-3
 #: A cache that is trained by time stays out of images until it has so many steps. Denoised images of 16 samples have
 #: over the squared error of `path` after 5, 10, 20, 40, 80 steps: veach-ajar 4.4 to 8.2, 2.5 to 8.4, 1.5 to 1.8, 0.7 to
 #: 2.0, 0.5 to 0.6; living room 1.1 to 1.2, 0.9, 0.8 to 0.9, 0.8, 0.8; Cornell box 1.1, 0.6, 0.6, 0.6, 0.5 (manual,
@@ -43,8 +43,9 @@ def denoised_threshold(mean_bias, steps, spp):
     times as much. Form and numbers fit six scenes after 40 and 150 steps, with 4, 16 and 48 samples
     (studies/spread_threshold.py).
     """
-    young = spp * mean_bias * dr.square(dr.square(YOUNG / steps))
-    return dr.maximum(ENDS * spp * mean_bias, young * dr.sqrt(young))
+    expected = spp * dr.maximum(mean_bias, LEAST_BIAS)
+    young = expected * dr.square(dr.square(YOUNG / steps))
+    return dr.maximum(ENDS * expected, young * dr.sqrt(young))
 
 
 class NeuralPathIntegrator(OutgoingIntegrator):
@@ -106,7 +107,8 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         """Samples of the finished image, the spread threshold, and training steps of the cache."""
         if self.left_out:
             return (1.0 if self.denoised else math.inf), math.inf, 1
-        return float(spp), grown(self.spread_threshold, spp), max(1, self.cache.steps)
+        threshold = self.spread_threshold if self.denoised else grown(self.spread_threshold, spp)
+        return float(spp), threshold, max(1, self.cache.steps)
 
     # -------------------------------------------------------------------------------------------------------------
 
@@ -196,12 +198,12 @@ NeuralPathIntegrator.__doc__ = (
      * - denoised
        - |bool|
        - The image will be denoised: the first surface does not show the cache, and ``spread_threshold`` is raised to
-         :math:`0.3 N b^2` and, after few training steps t, to :math:`(N b^2 (60/t)^4)^{3/2}` where that is more, b²
-         being the mean of the scene. (Default: false)
+         :math:`0.3 N b^2` and, after few training steps t, to :math:`(N b^2 (60/t)^4)^{3/2}` where that is more. b² is
+         the mean of the scene, at least 0.001. (Default: false)
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where
-         that is more; infinity: path tracing. (Default: 0.01)"""
+         that is more (with ``denoised`` as said there); infinity: path tracing. (Default: 0.01)"""
     + OUTGOING_KEYS
     + SHARED_KEYS
     + r"""

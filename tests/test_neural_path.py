@@ -23,7 +23,7 @@ from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
 from mi_neural.estimators.spread import grown
-from mi_neural.integrators.neural_path import ENDS, LEAST_STEPS, YOUNG, denoised_threshold
+from mi_neural.integrators.neural_path import ENDS, LEAST_BIAS, LEAST_STEPS, YOUNG, denoised_threshold
 from mi_neural.render.kernels import on_gpu
 
 #: Caches that are trained in a second.
@@ -166,7 +166,8 @@ def test_mean_bias_is_that_of_all_pairs(rng):
 
 
 def test_threshold_of_denoised_images_grows_with_samples_and_with_what_is_wrong():
-    assert denoised_threshold(0.0, 1e3, 64) == 0 and denoised_threshold(0.02, 1e3, 64) == pytest.approx(ENDS * 1.28)
+    assert denoised_threshold(0.0, 1e3, 64) == pytest.approx(ENDS * 64 * LEAST_BIAS)
+    assert denoised_threshold(0.02, 1e3, 64) == pytest.approx(ENDS * 1.28)
     assert denoised_threshold(0.01, 1e3, 64) == denoised_threshold(0.02, 1e3, 32) == pytest.approx(ENDS * 0.64)
 
 
@@ -342,7 +343,7 @@ def test_denoised_images_do_not_show_the_cache_at_the_first_surface(trained, box
         image = render(box, integrator, 4)
         found[denoised] = image[..., 3:5].mean(axis=(0, 1))
         assert image[..., 5:].max(initial=1) > 0
-    assert auto(denoised=True).settings(2) == (2, 0.01, 1) and auto(denoised=True).settings(512)[1] == 2.0
+    assert auto(denoised=True).settings(512) == (512, 0.01, 1) and auto().settings(512) == (512, 2.0, 1)
     print(f"(share, depth): {found[False]}, denoised {found[True]}")
     assert found[True][0] == 0 < found[False][0] and found[True][1] > found[False][1]
     assert integrator.queries_per_sample < copy_of(trained, box, tmp_path).queries_per_sample
