@@ -104,6 +104,25 @@ def agree(name, ours, theirs, allowed=0.05):
     assert off < allowed * norm
 
 
+@pytest.mark.parametrize("rr_depth", [1, 100])
+def test_derivative_by_the_albedo_is_known_also_where_roulette_ends_paths(rr_depth):
+    """In a sphere of albedo a around a point light the image is E a / (1 - a): its derivative over it 1 / (a (1 - a)),
+    4 for 1/2. While the probability of roulette was differentiated, too, it was 2 where paths may end from the first
+    bounce on."""
+    scene = mi.load_file(str(scenes.path("point_lit_sphere")), resx=8, resy=8)
+    params = mi.traverse(scene)
+    (key,) = (k for k in params.keys() if k.endswith("reflectance.value"))
+    albedo = params[key]
+    dr.enable_grad(albedo)
+    params.update()
+    integrator = mi.load_dict({"type": "plain_path", "max_depth": 24, "rr_depth": rr_depth})
+    image = mi.render(scene, params, integrator=integrator, spp=512)
+    dr.backward(dr.sum(image, axis=None))
+    found = float(np.sum(np.array(dr.grad(albedo)))) / float(np.sum(np.array(image)))
+    print(f"derivative over the image {found:.3f} (known 4)")
+    assert found == pytest.approx(4, rel=0.03)
+
+
 def train(scene, name, **keys):
     integrator = mi.load_dict({"type": name, **SMALL, **keys})
     with dr.suspend_grad():

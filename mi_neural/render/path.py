@@ -382,10 +382,10 @@ def survival(path: PathState, rr_depth: int, share=1, most=0.95):
 def roulette(path: PathState, sampler, rr_depth: int, share=1, u=None, most=0.95, q=None) -> tuple:
     """(the path, which may have ended, throughput divided by the probability that it has not; sampler).
 
-    E[β] is kept. `u`: a number in place of the sampler's, which decides for several paths together. `share`, `most`: of
-    :func:`survival`; `q`: in place of it.
+    E[β] is kept, and so is that of its derivative: q is detached, as the decision is. `u`: a number in place of the
+    sampler's, which decides for several paths together. `share`, `most`: of :func:`survival`; `q`: in place of it.
     """
-    q = survival(path, rr_depth, share, most) if q is None else q
+    q = dr.detach(survival(path, rr_depth, share, most) if q is None else q)
     u = sampler.next_1d() if u is None else u
     alive = path.active & (u < q) & (dr.max(path.β) > 0)
     return replace(path, β=path.β * dr.rcp(dr.maximum(q, 1e-6)), active=alive), sampler
