@@ -272,8 +272,9 @@ def test_balanced_stops_and_saves_the_ray(sphere):
 def test_trained_image_is_that_of_path_under_every_light(name):
     """Mean within 3 %, 16 blocks within 12 %, the camera looking through glass among other things."""
     scene = test_scene(lights(name))
-    image = render(scene, mi.load_dict({**TRAINED, "train_samples": 1024}), 128)
-    path = np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=1024), dtype=np.float64)
+    image = renders(scene, mi.load_dict({**TRAINED, "train_samples": 1024}), 4, 128).mean(axis=0)
+    # Under the area light, blocks behind the glass differ by up to 20 % between images of `path` of 1024 samples
+    path = renders(scene, {"type": "path"}, 8, 1024).mean(axis=0)
     blocks = [i.reshape(4, 4, 4, 4, 3).mean(axis=(1, 3, 4)) for i in (image, path)]
     error = np.abs(blocks[0] - blocks[1]) / np.maximum(blocks[1], 0.05 * path.mean())
     print(f"{name}: mean off by {image.mean() / path.mean() - 1:+.4f}, blocks by up to {error.max():.3f}")

@@ -63,7 +63,7 @@ def spot():
 
 @pytest.mark.parametrize("settings", [
     {"type": "nirc", "termination": "primary", "train_frames": 200, "train_samples": 2048},
-    pytest.param({"type": "nirc", "termination": "primary", "blend": "fast", "train_frames": 150},
+    pytest.param({"type": "nirc", "termination": "primary", "blend": "fast", "train_frames": 300},
                  marks=pytest.mark.slow),
     {"type": "nrc", "spread_threshold": 0.0, "train_frames": 150},
 ], ids=["nirc", "blend", "nrc"])  # fmt: skip
