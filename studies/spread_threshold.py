@@ -26,7 +26,7 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     mi.set_variant("llvm_ad_rgb")
     from mi_neural.bench import budget, load
     from mi_neural.image import exr, metrics
-    from mi_neural.integrators.neural_path import denoised_threshold
+    from mi_neural.integrators import neural_path
 
     exact = exr.read(reference)
     loaded = load.load_scene(str(scene), [exact.size], {})
@@ -49,9 +49,11 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
     budget.train(loaded.scene, ours, frames)
     ours.freeze_cache = True
     bias, spps = ours.cache.queried.grid.mean_bias[0], [int(n) for n in spp.split(",")]
-    ours.cache.queried.grid.mean_bias = mi.Float(0)  # or it would raise the thresholds by what it has measured
-    for samples in spps:
-        print(f"{loaded.name}, {samples} spp: neural_path takes c = {denoised_threshold(bias, frames, samples):.2g}")
+    own = [neural_path.denoised_threshold(bias, frames, n) for n in spps]
+    # Or it would raise the thresholds that are given
+    ours.cache.queried.grid.mean_bias, neural_path.LEAST_BIAS = mi.Float(0), 0.0
+    for samples, taken in zip(spps, own, strict=True):
+        print(f"{loaded.name}, {samples} spp: neural_path takes c = {taken:.2g}")
         line("path", path, samples)
         for c in map(float, thresholds.split(",")):
             ours.settings = lambda n, c=c: (n, c, frames)

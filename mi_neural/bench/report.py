@@ -153,7 +153,7 @@ def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
                 found = {g.key: g for g in scene.groups}
                 g = found.get((label, mode, budget, denoised))
                 clean = None if g is None else g.mean("flip_clean")
-                values = [] if g is None else [g.mean("relmse_trimmed"), g.mean("flip"), *([clean] if clean else [])]
+                values = [] if g is None else [g.mean("relmse_trimmed"), g.mean("flip"), *([] if clean is None else [clean])]
                 texts.append(" / ".join(map(number, values)))
                 first = found.get((kinds[0][0], mode, budget, denoised))
                 if g is not None and first is not None:
