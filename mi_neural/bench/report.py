@@ -152,8 +152,9 @@ def summary(report: Report) -> list[tuple[str, list[list[str]]]]:
             for scene in report.scenes:
                 found = {g.key: g for g in scene.groups}
                 g = found.get((label, mode, budget, denoised))
-                clean = None if g is None else g.mean("flip_clean")
-                values = [] if g is None else [g.mean("relmse_trimmed"), g.mean("flip"), *([] if clean is None else [clean])]
+                values = [] if g is None else [g.mean("relmse_trimmed"), g.mean("flip")]
+                if g is not None and (clean := g.mean("flip_clean")) is not None:
+                    values.append(clean)
                 texts.append(" / ".join(map(number, values)))
                 first = found.get((kinds[0][0], mode, budget, denoised))
                 if g is not None and first is not None:
