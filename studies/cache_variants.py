@@ -127,6 +127,7 @@ def variants() -> dict[str, Variant]:
         "normal": Variant({"inputs": "normal"}),
         "normal, albedo, roughness": Variant({"inputs": "normal, albedo, roughness"}),
         "width 16": Variant({"width": 16}),
+        "width 24": Variant({"width": 24}),
         "width 64": Variant({"width": 64}),
         "1 layer": Variant({"hidden_layers": 1}),
         "4 layers": Variant({"hidden_layers": 4}),
