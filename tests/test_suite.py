@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from mi_neural import scenes
 from mi_neural.bench import benchmark, collection, curves, load, reference, repeats, report, suite
+from mi_neural.bench.specs import parse_integrator
 from mi_neural.cli import app
 from mi_neural.image import exr, metrics
 
@@ -204,7 +205,7 @@ def test_scenes_and_repeats_end_in_one_report():
 def test_repeats_are_independent_and_train_by_their_own_seeds(monkeypatch):
     seeds = []
     loaded = load.load_scene("scenes/moon.xml", (6, 6))
-    (case,) = benchmark.make_cases(loaded, [load.parse_integrator("fake_cache")])
+    (case,) = benchmark.make_cases(loaded, [parse_integrator("fake_cache")])
     case.integrator.reseed = lambda seed: (seeds.append(seed), case.integrator.reset())
     assert isinstance(case.integrator, mi.Integrator)
     found = []

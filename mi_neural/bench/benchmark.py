@@ -33,8 +33,9 @@ from mi_neural.image import metrics
 
 from . import budget, denoise, memory, split
 from .budget import Rendered
-from .load import IntegratorSpec, LoadedScene, build_integrator, format_value
+from .load import LoadedScene
 from .reference import Reference
+from .specs import IntegratorSpec, build_integrator, format_value
 
 #: Frames that a steady row averages over, and those of a sample row.
 STEADY_FRAMES = 4
