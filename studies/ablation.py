@@ -78,12 +78,14 @@ def measure(
     images: int, progress=None,
 ) -> Result:  # fmt: skip
     """Compare the two modes of the plan; `frames` of training, then `images` frames of `spp` samples, `repeats` times
-    over."""
-    integrators = {}
-    for name, mode in ((EVERYTHING, "everything"), (PLANNED, "scene")):
-        keys = {**spec.keys, "plan": mode}
-        integrators[name], _ = build_integrator(IntegratorSpec(spec.type, keys), loaded.carried)
-        integrators[name].prepare(loaded.scene, spp=spp)
+    over. Both learn at one rate, that of the planned one: the default of `nrc` depends on `blend`, which is a part."""
+    planned, _ = build_integrator(IntegratorSpec(spec.type, {**spec.keys, "plan": "scene"}), loaded.carried)
+    rate = planned.cache.training.learning_rate
+    keys = {"learning_rate": rate, **spec.keys, "plan": "everything"}
+    everything, _ = build_integrator(IntegratorSpec(spec.type, keys), loaded.carried)
+    integrators = {EVERYTHING: everything, PLANNED: planned}
+    for integrator in integrators.values():
+        integrator.prepare(loaded.scene, spp=spp)
     exposures = metrics.flip_exposures(reference.rgb)
     seconds: dict[str, list] = {EVERYTHING: [], PLANNED: []}
     errors: dict[str, list] = {EVERYTHING: [], PLANNED: [], EQUAL_TIME: []}
