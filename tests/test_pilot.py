@@ -19,7 +19,6 @@ def box(bench):
     return bench.scene("cornell_box")
 
 
-
 @pytest.fixture(autouse=True)
 def pilot_at_once(monkeypatch):
     """The pilot looks before the first image, however small."""
