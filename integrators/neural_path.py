@@ -112,6 +112,13 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         threshold = self.spread_threshold if self.denoised else grown(self.spread_threshold, spp)
         return float(spp), threshold, max(1, self.cache.steps)
 
+    def expected_bias(self, spp: int) -> float:
+        """Squared relative bias of an image of `spp` samples that is not denoised, as far as the cache shows it at the
+        first surface; 0 where nothing was measured."""
+        if self.denoised or self.left_out or not self.needs_cache or self.cache.field is None:
+            return 0.0
+        return self.cache.queried.grid.expected_bias(spp)
+
     # -------------------------------------------------------------------------------------------------------------
 
     def estimate(self, scene, lights, field, sampler, ray, settings, active):

@@ -36,8 +36,9 @@ class Image:
 def rendered(scene, integrator: str, error: float, reference: Reference, keys: dict, seed: int) -> Image:
     """An image by an integrator that was trained for it alone."""
     ours, _ = build_integrator(parse_integrator(integrator), keys)
-    budget.train_first(scene, ours)
-    image, estimate = budget.render_until(scene, ours, error, seed=seed)
+    budget.warm_up(scene, ours, budget.pass_sizes(scene))
+    trained, _ = budget.train_first(scene, ours)
+    image, estimate = budget.render_until(scene, ours, error, seed=seed, trained=trained)
     found = metrics.relmse_trimmed(image.rgb, reference.rgb, reference.variance)
     return Image(integrator, error, estimate.value, found, image.spp, round(image.spp * found / error))
 

@@ -73,14 +73,55 @@ def test_rendering_ends_when_the_error_is_reached(box, kind, error):
 
 def test_bias_of_a_cache_does_not_pass_for_little_noise(box):
     """Few samples show the cache at the first surface, with hardly any noise: planned for four samples, rendering would
-    end with four. Of the bias that is left the estimate knows nothing."""
+    end with four. The estimate contains that bias, but not that of the ends of paths."""
     scene, known = box
     integrator = mi.load_dict({"type": "neural_path", "max_depth": 8, "train_frames": 48, "train_samples": 512})
     budget.train_first(scene, integrator)
-    rendered, estimate = budget.render_until(scene, integrator, 0.005)
+    rendered, estimate = budget.render_until(scene, integrator, 0.005, trained=None)
     true = metrics.relmse_trimmed(rendered.rgb, known)
     print(f"estimated {estimate}, true {true:.4f}, {rendered.spp} samples")
-    assert rendered.spp > 8 and true < 2 * 0.005
+    assert rendered.spp > 8 and 0 < estimate.bias < estimate.value and true < 1.3 * 0.005
+    assert estimate.low < estimate.value <= 0.005 < 1.5 * true
+
+
+def test_bias_that_an_image_will_have_is_what_it_has(box):
+    """A cache after a few steps, in images of 4 samples: over 4 seeds the squared bias that is expected is within a
+    factor of 2 of the mean product of two images' differences from the reference, of which their noise has no part."""
+    scene, known = box
+    integrator = mi.load_dict({"type": "neural_path", "max_depth": 8, "train_frames": 24, "train_samples": 512})
+    found, expected = [], []
+    for seed in range(4):
+        budget.reset(integrator, seed)
+        budget.train(scene, integrator, 24)
+        integrator.freeze_cache = True
+        integrator.plan_samples(4)
+        images = [budget.render_pass(scene, integrator, 4, k)[..., :3].astype(np.float64) - known for k in range(2)]
+        integrator.plan_samples(None)
+        integrator.freeze_cache = False
+        weights = metrics.relative_weights(metrics.luminance(known))[..., None]
+        found.append(np.mean(images[0] * images[1] * weights))
+        expected.append(integrator.expected_bias(4))
+    print(f"squared bias expected {expected}, found {found}")
+    assert 0.5 < np.mean(expected) / np.mean(found) < 2
+    denoised = mi.load_dict({"type": "neural_path", "denoised": True, "train_frames": 4, "train_samples": 512})
+    assert denoised.expected_bias(4) == 0  # of an untrained cache, and of an image without it at the first surface
+    budget.train(scene, denoised, 4)
+    assert denoised.expected_bias(4) == 0
+
+
+def test_a_cache_is_trained_for_its_share_of_a_long_rendering(box):
+    """Unless it was trained by hand before: the bias of a young cache would be there to the end."""
+    keys = {"max_depth": 8, "train_frames": 24, "train_samples": 512, "train_steps": 0, **NETWORK}
+    for trained, more in ((0.0, True), (1e6, False), (None, False)):
+        integrator = mi.load_dict({"type": "neural_path", **keys})
+        budget.warm_up(box[0], integrator, budget.pass_sizes(box[0]))
+        budget.train_first(box[0], integrator)
+        rendered, _ = budget.render_until(box[0], integrator, 0.004, trained=trained)
+        assert (integrator.cache.steps > 24) == more == (rendered.seconds_train > 0)
+        if more:
+            share = rendered.seconds_train / (rendered.seconds_train + rendered.seconds_render)
+            print(f"trained for {share:.2f} of the time")
+            assert 0.1 < share < 0.8
 
 
 def test_time_ends_it_first(box):

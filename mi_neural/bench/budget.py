@@ -11,6 +11,7 @@ training, and one pass is rendered with what has been learned.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -305,34 +306,49 @@ def render_seconds(
 
 def render_until(
     scene, integrator, error: float, seconds: float | None = None, seed: int = 0, sensor: int = 0,
-    progress: Progress | None = None, keep: Callable[[Rendered], None] | None = None,
+    progress: Progress | None = None, keep: Callable[[Rendered], None] | None = None, trained: float | None = 0.0,
 ) -> tuple[Rendered, ErrorEstimate | None]:  # fmt: skip
     """Render until the estimated trimmed relMSE is at most `error`, or for `seconds` if that comes first. Returns the
-    image and the estimate, which contains noise and not bias (:class:`~mi_neural.image.moments.Groups`).
+    image and the estimate: its noise (:class:`~mi_neural.image.moments.Groups`), and the squared bias of a cache that
+    says it (`expected_bias`).
 
     An integrator that measures the noise of tracing (`noise_of_pairs`) plans an image of so many samples that tracing
     alone would have this error. Otherwise it could accept a bias that the estimate does not contain.
 
     The error is estimated again after nine tenths of the samples that seem to be missing, at most as many as there are
-    already.
+    already. Then an integrator with `train_fraction` trains on until training has had that share of the time that the
+    image seems to take, or four times as many samples as there are; `trained`: seconds that it had before, None: it
+    does not train.
     """
     start, film, estimate, needed = clock(), Groups(), None, 4.0
+    expected_bias, bias = getattr(integrator, "expected_bias", lambda _: 0.0), 0.0  # the latter: mean of the passes
     run = _Run(scene, integrator, seed, sensor, keep, 0, film)
     sizes = pass_sizes(scene, sensor)
     try:
         while estimate is None or estimate.value > error:
             traced = statistics(integrator).get("noise_of_pairs", 0.0) / error
-            run.plan(max(round(needed), round(traced), film.spp + 1))
-            look = film.spp + max(1, min(film.spp, round(0.9 * (needed - film.spp))))
+            planned = max(round(needed), round(traced), film.spp + 1)
+            run.plan(planned)
+            before, look = film.spp, film.spp + max(1, min(film.spp, round(0.9 * (needed - film.spp))))
             while film.spp < look:
                 if film.spp and seconds is not None and clock() - start >= seconds:
-                    return run.result(), film.error()
+                    found = film.error()
+                    return run.result(), found and found.with_bias(max(bias, expected_bias(planned) ** 0.5) ** 2)
                 run.one_pass(max(s for s in sizes if s == 1 or s <= look - film.spp))
             estimate = film.error()
+            bias += (expected_bias(planned) ** 0.5 - bias) * (film.spp - before) / film.spp
             if estimate:
-                needed = film.spp * estimate.value / error
+                needed = film.spp * estimate.value / (error - min(bias**2, 0.5 * error))
+                estimate = estimate.with_bias(bias**2)
                 if progress:
                     progress(min(film.spp, needed), needed)
+                if trained is not None and estimate.value > error and hasattr(integrator, "train_fraction"):
+                    whole = run.seconds_render * min(needed / film.spp, 4.0)
+                    share = integrator.train_fraction(whole)
+                    missing = whole * share / (1 - share) - trained - run.seconds_train
+                    left = math.inf if seconds is None else seconds - (clock() - start)
+                    if missing > 0.1 * whole and left > 0:
+                        run.train_seconds(min(missing, left))
     except KeyboardInterrupt:
         run.interrupted = True
     finally:

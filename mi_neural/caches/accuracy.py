@@ -99,11 +99,22 @@ class Accuracy:
         """Weight of the cache's answer in the mix of least squared error, ``w = v/N / (v/N + b²)``, in an image of
         `n_samples` a pixel; the rest is traced."""
         i = self.entry(x, normal)
-        noise, bias = (dr.gather(mi.Float, v, i, active) for v in (self.noise, self.bias))
-        noise *= dr.rcp(mi.Float(n_samples))
+        return self.weight(*(dr.gather(mi.Float, v, i, active) for v in (self.noise, self.bias)), n_samples)
+
+    @staticmethod
+    def weight(noise, bias, n_samples):
+        """:meth:`share` where v is `noise` and b² is `bias`."""
+        noise = noise * dr.rcp(mi.Float(n_samples))
         total = noise + bias
         w = dr.select(total > 0, noise / dr.maximum(total, 1e-30), 0)
         return dr.select(w < NEGLIGIBLE, 0, dr.select(w > 1 - NEGLIGIBLE, 1, w))
+
+    def expected_bias(self, n_samples: float) -> float:
+        """Squared bias that :meth:`share` leaves in an image of `n_samples` a pixel, over the squared light: the mean
+        of w² b² over the pairs. What the traced part has of its own, as its paths end in the cache, is not in it."""
+        count, bias = self.sums[2], self.bias
+        w = self.weight(self.noise, bias, n_samples)
+        return float(dr.sum(count * dr.square(w) * bias)[0] / dr.maximum(dr.sum(count), 1e-3)[0])
 
     def observe(self, pairs: Pairs, decay) -> None:
         """Take in the `pairs` of a step. What a cell holds counts `decay` times as much as what is new. May be frozen.

@@ -240,8 +240,9 @@ class Job:
             # Training counts
             left = None if wanted.seconds is None else max(wanted.seconds - self.seconds_first, 0.0)
             rendered, self.estimate = budget.render_until(
-                scene, integrator, wanted.until_error, left, wanted.seed, progress=bar, keep=self.keep
-            )
+                scene, integrator, wanted.until_error, left, wanted.seed, progress=bar, keep=self.keep,
+                trained=None if wanted.pretrain or wanted.load_cache else self.seconds_first,
+            )  # fmt: skip
         elif wanted.seconds is not None:
             bar = bars(f"rendering for {wanted.seconds:g} s")
             rendered = budget.render_seconds(
@@ -280,9 +281,10 @@ class Job:
         first = f"first image {row.seconds_to_first_image:.1f} s after the start"
         terminal.out.print(f"wrote {wanted.output}; {first}", soft_wrap=True, markup=False)
         if (estimate := self.estimate) is not None:
+            contains = f"{estimate.bias:.2g} of it the bias of the cache" if estimate.bias else "of the noise alone"
             terminal.out.print(
                 f"estimated trimmed relMSE {estimate.value:.3g} ({100 * moments.CONFIDENCE:.0f} % interval "
-                f"{estimate.low:.3g} to {estimate.high:.3g}), of the noise alone, at {rendered.spp} samples a pixel",
+                f"{estimate.low:.3g} to {estimate.high:.3g}), {contains}, at {rendered.spp} samples a pixel",
                 soft_wrap=True, markup=False,
             )  # fmt: skip
 

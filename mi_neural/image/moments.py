@@ -108,11 +108,16 @@ class Moments(Accumulator):
 @dataclass(frozen=True)
 class ErrorEstimate:
     """Trimmed relMSE of an image against the limit of ever more samples, estimated from its own noise; and the ends of
-    an interval of confidence `CONFIDENCE`. A bias is not in it."""
+    an interval of confidence `CONFIDENCE`. All three contain the squared `bias`, as far as one is known."""
 
     value: float
     low: float
     high: float
+    bias: float = 0.0
+
+    def with_bias(self, bias: float) -> ErrorEstimate:
+        """The same noise and a squared relative bias of an image that was thought to have none."""
+        return ErrorEstimate(self.value + bias, self.low + bias, self.high + bias, bias)
 
 
 #: Of the interval of an :class:`ErrorEstimate`.
