@@ -21,6 +21,7 @@ from mi_neural.bench import budget, environment, load, terminal
 from mi_neural.bench import reference as references
 from mi_neural.bench.reference import Reference
 from mi_neural.bench.repeats import half_width
+from mi_neural.bench.specs import IntegratorSpec, build_integrator, parse_integrator
 from mi_neural.image import exr, metrics
 
 #: What is compared, and in which mode of the plan each is.
@@ -73,16 +74,18 @@ HEAD = ["scene", "everything, ms", "planned, ms", "times faster", "everything: r
 
 
 def measure(
-    loaded: load.LoadedScene, spec: load.IntegratorSpec, reference: Reference, *, frames: int, repeats: int, spp: int,
+    loaded: load.LoadedScene, spec: IntegratorSpec, reference: Reference, *, frames: int, repeats: int, spp: int,
     images: int, progress=None,
 ) -> Result:  # fmt: skip
     """Compare the two modes of the plan; `frames` of training, then `images` frames of `spp` samples, `repeats` times
-    over."""
-    integrators = {}
-    for name, mode in ((EVERYTHING, "everything"), (PLANNED, "scene")):
-        keys = {**spec.keys, "plan": mode}
-        integrators[name], _ = load.build_integrator(load.IntegratorSpec(spec.type, keys), loaded.carried)
-        integrators[name].prepare(loaded.scene, spp=spp)
+    over. Both learn at one rate, that of the planned one: the default of `nrc` depends on `blend`, which is a part."""
+    planned, _ = build_integrator(IntegratorSpec(spec.type, {**spec.keys, "plan": "scene"}), loaded.carried)
+    rate = planned.cache.training.learning_rate
+    keys = {"learning_rate": rate, **spec.keys, "plan": "everything"}
+    everything, _ = build_integrator(IntegratorSpec(spec.type, keys), loaded.carried)
+    integrators = {EVERYTHING: everything, PLANNED: planned}
+    for integrator in integrators.values():
+        integrator.prepare(loaded.scene, spp=spp)
     exposures = metrics.flip_exposures(reference.rgb)
     seconds: dict[str, list] = {EVERYTHING: [], PLANNED: []}
     errors: dict[str, list] = {EVERYTHING: [], PLANNED: [], EQUAL_TIME: []}
@@ -157,7 +160,7 @@ def reference_of(
     width, height = loaded.size
     path = folder / f"reference_{loaded.name}_{width}x{height}_{spp}.exr"
     if not path.is_file():
-        integrator, _ = load.build_integrator(load.parse_integrator(REFERENCE), loaded.carried)
+        integrator, _ = build_integrator(parse_integrator(REFERENCE), loaded.carried)
         integrator.train(loaded.scene, 100)
         n = max(8, spp // 16)
         images = []
@@ -201,7 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     results: list[Result] = []
     try:
-        spec = load.parse_integrator(options.integrator)
+        spec = parse_integrator(options.integrator)
         named = terminal.parse_define(options.reference)
         for name in options.scenes:
             loaded = load.load_scene(name, terminal.parse_size(options.size), terminal.parse_define(options.D))

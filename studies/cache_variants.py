@@ -25,6 +25,7 @@ from unittest import mock
 import numpy as np
 
 from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.bench.specs import IntegratorSpec, build_integrator
 from mi_neural.image import exr, metrics
 
 
@@ -218,8 +219,8 @@ def main(arguments: list[str] | None = None) -> int:
             for seed in range(options.seeds):
                 for label, variant in chosen.items():
                     with in_place(variant):
-                        spec = load.IntegratorSpec("nirc", {"termination": "primary", **variant.keys})
-                        integrator, _ = load.build_integrator(spec, loaded.carried)
+                        spec = IntegratorSpec("nirc", {"termination": "primary", **variant.keys})
+                        integrator, _ = build_integrator(spec, loaded.carried)
                         measure(loaded.scene, integrator, [1e-3], 12345, options.spp, judge)  # compiles all kernels
                         measure(loaded.scene, integrator, [1e-3], 12346, options.spp, judge)
                         measured.setdefault(label, []).append(

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.bench.specs import IntegratorSpec, build_integrator, parse_integrator, parse_keys
 from mi_neural.image import exr, metrics
 
 SAMPLES = (1, 4, 16, 64)
@@ -54,8 +55,8 @@ def one_shot(scene, integrator, seconds: float, seed: int) -> tuple[np.ndarray, 
 def reference(loaded, text: str, keys: dict, spp: int, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The reference image and the variance of each of its values, read where they are there."""
     if not path.is_file() or exr.read(path).layer("variance") is None:
-        spec = load.parse_integrator(text)
-        integrator, _ = load.build_integrator(load.IntegratorSpec(spec.type, {**keys, **spec.keys}), loaded.carried)
+        spec = parse_integrator(text)
+        integrator, _ = build_integrator(IntegratorSpec(spec.type, {**keys, **spec.keys}), loaded.carried)
         seeds = [budget.pass_seed(0, budget.STREAM_REFERENCE, k) for k in range(max(2, spp // PASS))]
         images = [budget.render_pass(loaded.scene, integrator, PASS, s)[..., :3].astype(np.float64) for s in seeds]
         variance = np.var(images, axis=0, ddof=1) / len(images)
@@ -82,7 +83,7 @@ def main(arguments: list[str] | None = None) -> int:
     import drjit as dr
 
     options.output.mkdir(parents=True, exist_ok=True)
-    keys = load.parse_keys(options.define, "-D")
+    keys = parse_keys(options.define, "-D")
     loaded = load.load_scene(options.scene, terminal.parse_size(options.size))
     path = options.output / "reference.exr"
     known, variance = reference(loaded, options.reference, keys, options.reference_spp, path)
@@ -90,8 +91,8 @@ def main(arguments: list[str] | None = None) -> int:
     dr.set_thread_count(1)
     cases = {}
     for text in options.integrator:
-        spec = load.parse_integrator(text)
-        cases[text], _ = load.build_integrator(load.IntegratorSpec(spec.type, {**keys, **spec.keys}), loaded.carried)
+        spec = parse_integrator(text)
+        cases[text], _ = build_integrator(IntegratorSpec(spec.type, {**keys, **spec.keys}), loaded.carried)
         budget.warm_up(loaded.scene, cases[text], list(SAMPLES))
     rows = {text: [] for text in cases}
     for repeat in range(options.repeats):

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_neural.bench import budget, environment, load, terminal
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr
 from mi_neural.image.metrics import TRIM_FRACTION
 from mi_neural.render.kernels import work_seconds
@@ -91,8 +92,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         loaded = load.load_scene(options.scene, size=terminal.parse_size(options.size),
                                  parameters=terminal.parse_define(options.D))  # fmt: skip
-        specs = [load.parse_integrator(text) for text in options.integrator]
-        integrators = {s.label: load.build_integrator(s, loaded.carried)[0] for s in specs}
+        specs = [parse_integrator(text) for text in options.integrator]
+        integrators = {s.label: build_integrator(s, loaded.carried)[0] for s in specs}
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

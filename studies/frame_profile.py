@@ -27,6 +27,7 @@ from statistics import median
 import numpy as np
 
 from mi_neural.bench import budget, environment, load, memory, split, terminal
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr
 from mi_neural.render.frozen import undisturbed
 
@@ -224,8 +225,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         terminal.set_variant(options.variant)
         loaded = load.load_scene(options.scene, terminal.parse_size(options.size), terminal.parse_define(options.D))
-        spec = load.parse_integrator(options.integrator)
-        integrator, _ = load.build_integrator(spec, loaded.carried)
+        spec = parse_integrator(options.integrator)
+        integrator, _ = build_integrator(spec, loaded.carried)
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_neural.bench import environment, load, terminal
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr
 from mi_neural.render.kernels import work_seconds
 
@@ -96,7 +97,7 @@ def loss_gradient(scene, spp: int, carried: dict):
     import drjit as dr
     import mitsuba as mi
 
-    path, _ = load.build_integrator(load.parse_integrator("path"), carried)
+    path, _ = build_integrator(parse_integrator("path"), carried)
     with dr.suspend_grad():
         image = np.array(mi.render(scene, integrator=path, spp=spp, seed=12345), np.float64)[..., :3]
     weight = 1 / (image + EPSILON * max(image.mean(), 1e-30)) / image.size
@@ -117,7 +118,7 @@ def measure(scene, integrators: dict, carried: dict, spp: int, rounds: int, fram
 
     params, keys = enable(scene)
     loss = loss_gradient(scene, 256, carried)
-    prb, _ = load.build_integrator(load.parse_integrator("prb"), carried)
+    prb, _ = build_integrator(parse_integrator("prb"), carried)
     true, noise = moments([gradients(scene, params, keys, prb, loss, reference, 10_000 + k)[0] for k in range(rounds)])
     noise = [v / rounds for v in noise]
     norm2 = {k: float(np.sum(t**2)) for k, t in zip(keys, true, strict=True)}
@@ -193,8 +194,8 @@ def main(arguments: list[str] | None = None) -> int:
         loaded = load.load_scene(options.scene, size=terminal.parse_size(options.size),
                                  parameters=terminal.parse_define(options.D))  # fmt: skip
         carried = {**loaded.carried, "max_depth": options.max_depth}
-        specs = [load.parse_integrator(text) for text in options.integrator]
-        integrators = {s.label: load.build_integrator(s, carried)[0] for s in specs}
+        specs = [parse_integrator(text) for text in options.integrator]
+        integrators = {s.label: build_integrator(s, carried)[0] for s in specs}
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

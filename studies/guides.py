@@ -27,6 +27,7 @@ def main(scene: Path, reference: Path, spp: str = "4,32", integrator: str = "pat
 
     mi.set_variant("llvm_ad_rgb")
     from mi_neural.bench import budget, guides, load
+    from mi_neural.bench.specs import build_integrator, parse_integrator
     from mi_neural.image import denoise, exr, metrics
 
     exact = exr.read(reference)
@@ -44,8 +45,8 @@ def main(scene: Path, reference: Path, spp: str = "4,32", integrator: str = "pat
         "filtered": (*denoise.prefilter(*own), True),
         "64": (*denoise.prefilter(*rendered(guides._integrator(), 64)), True),
     }
-    spec = load.parse_integrator(integrator)
-    built, _ = load.build_integrator(spec, {"max_depth": max_depth})
+    spec = parse_integrator(integrator)
+    built, _ = build_integrator(spec, {"max_depth": max_depth})
     budget.train(loaded.scene, built, 150)
     for samples in map(int, spp.split(",")):
         noisy = budget.render_samples(loaded.scene, built, samples, 3).rgb

@@ -21,6 +21,7 @@ import numpy as np
 
 from mi_neural import scenes
 from mi_neural.bench import benchmark, budget, environment, load, repeats, suite, terminal
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr
 
 SAMPLERS = ("uniform_lights", "power_lights", "tree_lights", "nvc_lights")
@@ -55,7 +56,7 @@ def write_reference(file: Path, size: tuple[int, int], spp: int) -> None:
     if out.is_file():
         return
     loaded = load.load_scene(str(file), size)
-    integrator, _ = load.build_integrator(load.parse_integrator(CONTROL), loaded.carried)
+    integrator, _ = build_integrator(parse_integrator(CONTROL), loaded.carried)
     images = []
     for k in range(PASSES):
         seed = budget.pass_seed(0, budget.STREAM_REFERENCE, k)
@@ -77,7 +78,7 @@ def measure(files: list[Path], output: Path, options, bars) -> list[repeats.Grou
             seed=options.seed + repeat, repeats=1,
         )  # fmt: skip
         settings = suite.Settings(
-            specs=[load.parse_integrator(text) for text in options.integrator or INTEGRATORS], plan=plan,
+            specs=[parse_integrator(text) for text in options.integrator or INTEGRATORS], plan=plan,
             sizes=[terminal.parse_size(options.size)],
         )  # fmt: skip
         comparison = suite.Suite(files, settings, output / f"repeat_{repeat}", bars)

@@ -23,6 +23,7 @@ import numpy as np
 from mi_neural.bench import environment, load, terminal
 from mi_neural.bench import reference as references
 from mi_neural.bench.reference import Reference
+from mi_neural.bench.specs import IntegratorSpec, build_integrator
 from mi_neural.image import exr
 from mi_neural.image.metrics import bias_and_variance
 
@@ -59,14 +60,14 @@ def bias_of(scene, integrator, reference: Reference, samples: int) -> tuple[floa
 def curve(scene, name: str, keys: dict, thresholds, reference: Reference, samples: int, frames: int) -> list[Point]:
     """The points of one integrator, its cache trained once by `frames` frames; `rays` is the depth as yet."""
     keys = {"channels": "depth", **keys}
-    trained, _ = load.build_integrator(load.IntegratorSpec(name), keys)
+    trained, _ = build_integrator(IntegratorSpec(name), keys)
     trained.train(scene, frames)
     points = []
     with tempfile.TemporaryDirectory() as folder:
         trained.save_cache(Path(folder) / "cache")
         for threshold in thresholds:
-            integrator, _ = load.build_integrator(
-                load.IntegratorSpec(name), {**keys, "freeze_cache": True, "spread_threshold": threshold}
+            integrator, _ = build_integrator(
+                IntegratorSpec(name), {**keys, "freeze_cache": True, "spread_threshold": threshold}
             )
             integrator.load_cache(Path(folder) / "cache", scene)
             bias, depth = bias_of(scene, integrator, reference, samples)

@@ -28,6 +28,7 @@ from statistics import median
 import numpy as np
 
 from mi_neural.bench import budget, environment, load, memory, terminal
+from mi_neural.bench.specs import IntegratorSpec, build_integrator, parse_integrator, parse_keys
 from mi_neural.image import exr
 
 #: Values that are varied by default.
@@ -81,7 +82,7 @@ def settings(over: str, values: tuple[str, ...], scene: str, size: tuple[int, in
     if over == "cores":
         return [Setting(v, scene, size, spp, {}, _count(over, v)) for v in values or _powers(environment.cores())]
     key = "width" if over == "network" else over
-    return [Setting(v, scene, size, spp, load.parse_keys([f"{key}={v}"], "--over")) for v in values]
+    return [Setting(v, scene, size, spp, parse_keys([f"{key}={v}"], "--over")) for v in values]
 
 
 def _count(over: str, text: str) -> int:
@@ -121,7 +122,7 @@ def lit_floor(n: int, size: tuple[int, int] | None):
 
 
 def sweep(
-    over: list[Setting], spec: load.IntegratorSpec, parameters: dict[str, str], rounds: int, frames: int
+    over: list[Setting], spec: IntegratorSpec, parameters: dict[str, str], rounds: int, frames: int
 ) -> Iterator[Point]:
     """Measure `spec` at each setting, in turn. `rounds` frames are timed, after `frames` of training."""
     import drjit as dr
@@ -149,10 +150,10 @@ def _scene(setting: Setting, parameters: dict[str, str]) -> tuple[object, dict[s
     return loaded.scene, loaded.carried
 
 
-def _point(setting: Setting, scene, carried: dict, spec: load.IntegratorSpec, rounds: int, frames: int) -> Point:
+def _point(setting: Setting, scene, carried: dict, spec: IntegratorSpec, rounds: int, frames: int) -> Point:
     memory.start()
-    own = load.IntegratorSpec(spec.type, {**spec.keys, **setting.keys})
-    integrator, _ = load.build_integrator(own, carried)
+    own = IntegratorSpec(spec.type, {**spec.keys, **setting.keys})
+    integrator, _ = build_integrator(own, carried)
     budget.warm_up(scene, integrator, [setting.spp])
     budget.train(scene, integrator, frames)
     before, trained = budget.statistics(integrator), []
@@ -242,7 +243,7 @@ def main(arguments: list[str] | None = None) -> int:
         if values is None:
             raise load.InputError(f"--over {over}: give values, as in --over {over}=1,2,4; or {', '.join(DEFAULTS)}")
         sweeping = settings(over, values, options.scene, terminal.parse_size(options.size), options.spp)
-        for spec in (load.parse_integrator(text) for text in options.integrator):
+        for spec in (parse_integrator(text) for text in options.integrator):
             points = found.setdefault(spec.label, [])
             for point in sweep(sweeping, spec, terminal.parse_define(options.D), options.rounds, options.frames):
                 points.append(point)

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_neural.bench import budget, denoise, environment, load, terminal
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr, metrics
 
 
@@ -125,7 +126,7 @@ def main(arguments: list[str] | None = None) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     records: list[dict] = []
     try:
-        specs = [load.parse_integrator(text) for text in options.integrator]
+        specs = [parse_integrator(text) for text in options.integrator]
         sizes = terminal.parse_sizes(options.size)
         named = terminal.parse_define(options.reference)
         for name in options.scenes:
@@ -134,7 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
             reference = reference_of(loaded, options.output, spp, path, same_depth=True)
             judge = Judge(loaded.scene, reference, options.denoise)
             for spec in specs:
-                integrator, _ = load.build_integrator(spec, loaded.carried)
+                integrator, _ = build_integrator(spec, loaded.carried)
                 found = measure(
                     loaded.scene, integrator, judge, sorted(options.paths or options.frames), options.spp,
                     seeds=options.seeds, images=options.images, paths=options.paths is not None,

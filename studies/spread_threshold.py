@@ -25,6 +25,7 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
 
     mi.set_variant("llvm_ad_rgb")
     from mi_neural.bench import budget, load
+    from mi_neural.bench.specs import build_integrator, parse_integrator
     from mi_neural.image import exr, metrics
     from mi_neural.integrators import neural_path
 
@@ -44,8 +45,8 @@ def main(scene: Path, reference: Path, frames: int = 400, spp: str = "16,64", th
         print(f"{loaded.name}, {samples} spp, {name:8} {seconds:5.1f} s  {error:.5f} / {flips[0]:.4f} / {flips[1]:.4f}",
               flush=True)  # fmt: skip
 
-    path, _ = load.build_integrator(load.parse_integrator("path"), {"max_depth": max_depth})
-    ours, _ = load.build_integrator(load.parse_integrator("neural_path:denoised=true"), {"max_depth": max_depth})
+    path, _ = build_integrator(parse_integrator("path"), {"max_depth": max_depth})
+    ours, _ = build_integrator(parse_integrator("neural_path:denoised=true"), {"max_depth": max_depth})
     budget.train(loaded.scene, ours, frames)
     ours.freeze_cache = True
     bias, spps = ours.cache.queried.grid.mean_bias[0], [int(n) for n in spp.split(",")]

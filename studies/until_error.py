@@ -17,6 +17,7 @@ from pathlib import Path
 from mi_neural.bench import budget, environment, load, terminal
 from mi_neural.bench import reference as references
 from mi_neural.bench.reference import Reference
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr, metrics
 
 
@@ -34,7 +35,7 @@ class Image:
 
 def rendered(scene, integrator: str, error: float, reference: Reference, keys: dict, seed: int) -> Image:
     """An image by an integrator that was trained for it alone."""
-    ours, _ = load.build_integrator(load.parse_integrator(integrator), keys)
+    ours, _ = build_integrator(parse_integrator(integrator), keys)
     budget.warm_up(scene, ours, budget.pass_sizes(scene))
     trained, _ = budget.train_first(scene, ours)
     image, estimate = budget.render_until(scene, ours, error, seed=seed, trained=trained)
@@ -61,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     mi.set_variant(options.variant)
     try:
         loaded, reference = references.with_scene(options.scene, options.reference, terminal.parse_size(options.size))
-        load.parse_integrator(options.integrator[0])
+        parse_integrator(options.integrator[0])
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

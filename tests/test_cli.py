@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_cache import register
-from test_benchmark import KEYS, WHITE, boxes, has_denoiser
+from test_benchmark import KEYS
+from test_denoise import has_denoiser
+from test_load import WHITE, boxes
 from typer.main import get_command
 from typer.testing import CliRunner
 

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from mi_neural.bench import benchmark, budget, changes, cluster, jobs, load, sequence
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import parse_integrator
 from mi_neural.bench.workers import ClusterError, Workers, connect
 from mi_neural.cli import app
 from mi_neural.image import exr
@@ -164,7 +165,7 @@ def test_one_pass_says_nothing_about_its_variance(rng):
 
 def setup_of(integrator: str = "path") -> tuple[jobs.Setup, load.LoadedScene, benchmark.Case]:
     loaded = load.load_scene("cornell_box", SIZE)
-    case = benchmark.make_cases(loaded, [load.parse_integrator(integrator)])[0]
+    case = benchmark.make_cases(loaded, [parse_integrator(integrator)])[0]
     return jobs.Setup.of(loaded, case, SIZE), loaded, case
 
 
@@ -273,7 +274,7 @@ def test_frames_of_two_workers_are_those_of_one_process(address, tmp_path, integ
 
     def run(folder: Path, client: str | None) -> list[np.ndarray]:
         loaded = load.load_scene("cornell_box", SIZE, merge=False)
-        case = benchmark.make_cases(loaded, [load.parse_integrator(integrator)])[0]
+        case = benchmark.make_cases(loaded, [parse_integrator(integrator)])[0]
         over_time = sequence.Sequence(loaded.scene, changes.parse(texts, 4, None), 4)
         with connect(client) as workers:
             elsewhere = workers and cluster.frames_of(workers, loaded, SIZE, texts, over_time, plan)

@@ -18,7 +18,8 @@ from test_nrc import assert_like_path, constant_field
 from test_vertex import lights, test_scene
 
 from mi_neural import scenes
-from mi_neural.bench.load import InputError, IntegratorSpec, build_integrator, parse_integrator
+from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import IntegratorSpec, build_integrator, parse_integrator
 from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths

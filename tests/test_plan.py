@@ -313,12 +313,13 @@ def test_inputs_that_are_left_out_do_not_raise_the_error():
 def test_planned_is_faster_than_everything_and_no_worse(name, type_, tmp_path):
     """In a scene of one light: by the ablation's own measure, at half of what it finds there."""
     from mi_neural.bench import load
+    from mi_neural.bench.specs import parse_integrator
 
     ablation = load_study("ablation")
 
     loaded = load.load_scene(name, (64, 64))
     reference = ablation.reference_of(loaded, tmp_path, 512, None)
-    found = ablation.measure(loaded, load.parse_integrator(type_), reference, frames=80, repeats=3, spp=8, images=2)
+    found = ablation.measure(loaded, parse_integrator(type_), reference, frames=80, repeats=3, spp=8, images=2)
     print(found.line())
     assert found.faster.mean > 1.1 and "light_sampler" in found.left_out
     assert all(d.mean - d.half <= 0 for d in found.higher.values())

@@ -19,6 +19,10 @@ def box(bench):
     return bench.scene("cornell_box")
 
 
+@pytest.fixture(scope="module")
+def sphere(bench):
+    return bench.scene("point_lit_sphere")
+
 
 @pytest.fixture(scope="module")
 def poor(bench, box):

@@ -10,7 +10,7 @@ import pytest
 from load_study import load_study
 
 from mi_neural import scenes
-from mi_neural.bench import load
+from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.scenes import public
 
 
@@ -102,7 +102,7 @@ def test_commands_of_every_table_name_what_exists(results):
             assert not {word for word in named if not word.startswith("$OUT")} - known, file.name
     assert len(built) > 20
     for text in sorted(built):
-        load.build_integrator(load.parse_integrator(text))
+        build_integrator(parse_integrator(text))
 
 
 def test_a_table_of_a_gpu_waits_for_one(results, table, monkeypatch):

@@ -11,6 +11,7 @@ from fake_cache import register
 from load_study import load_study
 
 from mi_neural.bench import budget, load, memory, split
+from mi_neural.bench.specs import build_integrator, parse_integrator
 
 scaling = load_study("scaling")
 
@@ -107,8 +108,8 @@ def test_parts_of_a_frame_add_up():
     register()
     loaded = load.load_scene("cornell_box", (16, 12))
     for text in ("path", "fake_cache"):
-        spec = load.parse_integrator(text)
-        integrator, keys = load.build_integrator(spec, loaded.carried)
+        spec = parse_integrator(text)
+        integrator, keys = build_integrator(spec, loaded.carried)
         found = split.measure(loaded.scene, integrator, 1, frames=3)
         parts = [found.train, found.query or 0.0, found.trace, found.film, found.python]
         assert all(p >= 0 for p in parts) and sum(parts) == pytest.approx(found.total, rel=0.05)
@@ -120,7 +121,7 @@ def test_training_step_and_queries_are_found(monkeypatch):
     """By an integrator that sleeps where it trains and says how many queries it makes."""
     register()
     loaded = load.load_scene("cornell_box", (16, 12))
-    integrator, _ = load.build_integrator(load.parse_integrator("fake_cache"), loaded.carried)
+    integrator, _ = build_integrator(parse_integrator("fake_cache"), loaded.carried)
     render, facts = budget.render_pass, {"seconds_train": 0.0, "queries": 0, "ns_per_query": 1.0}
 
     def learning(*args):
@@ -139,7 +140,7 @@ def test_training_step_and_queries_are_found(monkeypatch):
 def test_training_that_is_queued_counts_as_training():
     """Most of a small image's time: a step of 2048 paths against 192 samples."""
     loaded = load.load_scene("cornell_box", (16, 12))
-    integrator, _ = load.build_integrator(load.parse_integrator("nrc"), loaded.carried)
+    integrator, _ = build_integrator(parse_integrator("nrc"), loaded.carried)
     integrator.train(loaded.scene, 16)
     found = split.measure(loaded.scene, integrator, 1, frames=3)
     alone = np.median([split.kernels(lambda: integrator.train(loaded.scene, 1))[1] for _ in range(5)])  # as `found` is

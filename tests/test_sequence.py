@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from mi_neural.bench import benchmark, changes, load, plots, sequence, sequence_pictures
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import parse_integrator
 from mi_neural.cli import app
 from mi_neural.image import exr
 
@@ -258,7 +259,7 @@ def run_of(loaded, folder: Path, text: str = "value*(1+after)", specs=("path",),
     over_time = sequence.Sequence(loaded.scene, functions, frames, 2)
     folder.mkdir(exist_ok=True)
     run = sequence.Run(loaded, over_time, sequence.Plan(spp=spp, **plan), folder, reference)
-    return run, benchmark.make_cases(loaded, [load.parse_integrator(s) for s in specs])
+    return run, benchmark.make_cases(loaded, [parse_integrator(s) for s in specs])
 
 
 def rows_of(folder: Path) -> list[dict]:
@@ -366,7 +367,7 @@ def test_nirc_follows_a_light_that_is_switched_on_and_geometry_that_moves(tmp_pa
     )
     over_time = sequence.Sequence(loaded.scene, functions, 12, 2)
     run = sequence.Run(loaded, over_time, sequence.Plan(spp=16, pretrain=4), tmp_path, 64)
-    rows = run.run(benchmark.make_cases(loaded, [load.parse_integrator("nirc:train_steps=4,train_samples=1024")]))
+    rows = run.run(benchmark.make_cases(loaded, [parse_integrator("nirc:train_steps=4,train_samples=1024")]))
     rows = rows[0].rows
     assert max(r["mean"] for r in rows[:2]) < 1e-15 and all(r["nonfinite"] == 0 for r in rows)
     means = [run.references.of(k).rgb.mean() for k in range(12)]

@@ -25,7 +25,7 @@ def test_command_compares_settings_after_equal_training(tmp_path, capsys, varian
 
 
 def test_images_do_not_train(monkeypatch):
-    integrator, scene, calls = study.load.build_integrator(study.load.parse_integrator("nirc"), {})[0], object(), []
+    integrator, scene, calls = study.build_integrator(study.parse_integrator("nirc"), {})[0], object(), []
 
     class Judge:
         def errors(self, image):

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,8 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from mi_neural import scenes
-from mi_neural.bench import benchmark, collection, curves, load, reference, repeats, report, suite
+from mi_neural.bench import benchmark, collection, curves, kept, load, reference, repeats, report, suite
+from mi_neural.bench.specs import parse_integrator
 from mi_neural.cli import app
 from mi_neural.image import exr, metrics
 
@@ -204,7 +206,7 @@ def test_scenes_and_repeats_end_in_one_report():
 def test_repeats_are_independent_and_train_by_their_own_seeds(monkeypatch):
     seeds = []
     loaded = load.load_scene("scenes/moon.xml", (6, 6))
-    (case,) = benchmark.make_cases(loaded, [load.parse_integrator("fake_cache")])
+    (case,) = benchmark.make_cases(loaded, [parse_integrator("fake_cache")])
     case.integrator.reseed = lambda seed: (seeds.append(seed), case.integrator.reset())
     assert isinstance(case.integrator, mi.Integrator)
     found = []
@@ -256,6 +258,26 @@ def test_interrupted_comparison_of_scenes_goes_on(monkeypatch):
     curve = [(r["scene"], r["label"], r["repeat"], r["spp"]) for r in results()["rows"] if r["mode"] == "curve"]
     assert len(set(curve)) == len(curve) and {c[:3] for c in curve} == {r[:3] for r in after}
     assert not list(Path("out").rglob("rows.jsonl"))
+
+
+def test_recalled_row_costs_one_map(monkeypatch, tmp_path, rng):
+    """Its errors are on disk, and no map is shown against the denoised reference."""
+    made = row(image="path.exr")
+    image, known = rng.random((6, 8, 3)).astype(np.float32), rng.random((3, 4, 3)).astype(np.float32)
+    exr.write(tmp_path / "path.exr", image)
+    there = kept.Kept(tmp_path, {})
+    there.add(made)
+    pair = reference.Reference(known, None, {}, None, known)
+    expected = benchmark.judge(SimpleNamespace(), [exr.read(tmp_path / "path.exr").rgb], pair)
+    n, flip = [], metrics.flip
+    monkeypatch.setattr(metrics, "flip", lambda *args: n.append(1) or flip(*args))
+    monkeypatch.setattr(metrics, "relmse", None)
+    key = (made.label, made.mode, made.budget_seconds, made.denoised, made.repeat)
+    (found,) = there.pictures([key], pair, None)
+    assert len(n) == 1 and found.row is made and np.array_equal(found.rgb, exr.read(tmp_path / "path.exr").rgb)
+    assert np.array_equal(found.flip_map, expected)
+    (found,) = there.pictures([key], None, None)
+    assert len(n) == 1 and found.flip_map is None
 
 
 # ---------------------------------------------------------------- images made elsewhere

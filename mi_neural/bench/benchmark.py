@@ -33,8 +33,9 @@ from mi_neural.image import metrics
 
 from . import budget, denoise, memory, split
 from .budget import Rendered
-from .load import IntegratorSpec, LoadedScene, build_integrator, format_value
+from .load import LoadedScene
 from .reference import Reference
+from .specs import IntegratorSpec, build_integrator, format_value
 
 #: Frames that a steady row averages over, and those of a sample row.
 STEADY_FRAMES = 4
@@ -178,10 +179,13 @@ class Bench:
 
     def recall(self, case: Case, plan: Plan) -> bool:
         """Hand over all rows of a case if none is left to be measured; returns whether that is so."""
-        found = [self.kept.pictures(keys, self.reference, self.exposures) for keys, _ in self._parts(case, plan)]
-        if not all(found):
-            return False
-        for picture in (picture for pictures in found for picture in pictures):
+        found = []
+        for keys, _ in self._parts(case, plan):
+            pictures = self.kept.pictures(keys, self.reference, self.exposures)
+            if not pictures:
+                return False
+            found += pictures
+        for picture in found:
             self.on_picture(picture)
         return True
 
@@ -382,6 +386,16 @@ def judge(
     if reference.clean is not None:
         row.flip_clean = float(np.mean([metrics.flip(image, reference.clean, exposures).mean for image in images]))
     return found[0].map
+
+
+def flip_map(
+    image: np.ndarray, reference: Reference | None, exposures: metrics.FlipExposures | None = None
+) -> np.ndarray | None:
+    """The map that :func:`judge` returns for this image, alone."""
+    if reference is None:
+        return None
+    (image,) = _averaged([image], reference)
+    return metrics.flip(image, reference.rgb, exposures).map
 
 
 def _averaged(images: list[np.ndarray], reference: Reference) -> list[np.ndarray]:

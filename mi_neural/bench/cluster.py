@@ -30,7 +30,8 @@ from mi_neural.image import exr
 from mi_neural.image.moments import Moments
 
 from . import benchmark, budget, jobs, sequence
-from .load import InputError, LoadedScene, load_scene, parse_integrator, split_channels
+from .load import InputError, LoadedScene, load_scene, split_channels
+from .specs import parse_integrator
 from .workers import PATIENCE, Answer, ClusterError, Workers, connect
 
 #: Fewest passes of an image that has so many samples: the variance is estimated from their spread.

@@ -17,9 +17,10 @@ from pathlib import Path
 from mi_neural.image.moments import Moments
 
 from . import benchmark, budget, changes, denoise, environment
-from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, find_scene, load_scene
+from .load import InputError, LoadedScene, find_scene, load_scene
 from .reference import Reference
 from .sequence import STREAM_FRAMES, Sequence
+from .specs import IntegratorSpec, build_integrator
 
 #: Statistics of integrators that are sums over images.
 COUNTS = ("queries", "nonfinite")

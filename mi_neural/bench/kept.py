@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mi_neural.image import exr
 
-from .benchmark import WITHOUT_PICTURE, Picture, Row, judge, plain
+from .benchmark import WITHOUT_PICTURE, Picture, Row, flip_map, plain
 from .reference import Reference
 
 FILE = "rows.jsonl"
@@ -81,8 +81,7 @@ class Kept:
             except (OSError, ValueError):
                 return None
             # Errors stay as they were measured; the map is not on disk
-            flip_map = judge(Row(**vars(row)), [rgb], reference, exposures)
-            found.append(Picture(row, None, rgb, flip_map))
+            found.append(Picture(row, None, rgb, flip_map(rgb, reference, exposures)))
         return found
 
     def finish(self) -> None:

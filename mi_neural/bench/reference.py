@@ -22,7 +22,8 @@ from mi_neural.image import exr
 from mi_neural.image.metrics import block_means, count_nonfinite, relative_squared_errors
 
 from .budget import STREAM_REFERENCE, Progress, clock, pass_seed, pixels, render_pass
-from .load import InputError, IntegratorSpec, LoadedScene, build_integrator, load_scene, split_channels, user_path
+from .load import InputError, LoadedScene, load_scene, split_channels, user_path
+from .specs import IntegratorSpec, build_integrator
 
 #: Passes hold about this many samples and at most MAX_PASS_SPP a pixel: many passes, or there is no variance to
 #: estimate.

@@ -26,8 +26,9 @@ from mi_neural.image import exr, metrics
 from . import benchmark, budget, denoise
 from .benchmark import Case, plain
 from .budget import clock
-from .load import InputError, LoadedScene, file_name, require_distinct
+from .load import InputError, LoadedScene
 from .sequence_files import Keeper, frame_path, read_json, write_rows
+from .specs import file_name, require_distinct
 from .timeline import References, Sequence, check_frames
 
 #: Stream of random numbers of the frames; those below it belong to :mod:`budget`.

@@ -26,6 +26,7 @@ from statistics import median
 import numpy as np
 
 from . import budget, load
+from .specs import IntegratorSpec, build_integrator, parse_integrator
 
 #: Frames that are measured, after those in which functions are recorded.
 FRAMES, WARM_FRAMES = 5, 2
@@ -90,7 +91,7 @@ def measure(scene, integrator, spp: int = 1, frames: int = FRAMES) -> Split:
     return Split(spp, total, train, query or None, trace, developed, python)
 
 
-def ablated_query(scene, spec: load.IntegratorSpec, keys: dict, integrator, spp: int = 1) -> float | None:
+def ablated_query(scene, spec: IntegratorSpec, keys: dict, integrator, spp: int = 1) -> float | None:
     """Nanoseconds of a query within the image's own kernel; None for an integrator without a number `cache_samples`.
 
     `integrator`, built from `spec` and `keys`, is trained and warm. Another with MORE_SAMPLES more takes over its
@@ -99,7 +100,7 @@ def ablated_query(scene, spec: load.IntegratorSpec, keys: dict, integrator, spp:
     few = getattr(integrator, "cache_samples", None)
     if not isinstance(few, int) or few < 1:
         return None
-    more, _ = load.build_integrator(load.IntegratorSpec(spec.type, {**spec.keys, "cache_samples": few + MORE_SAMPLES}),
+    more, _ = build_integrator(IntegratorSpec(spec.type, {**spec.keys, "cache_samples": few + MORE_SAMPLES}),
                                     {k: v for k, v in keys.items() if k not in spec.keys})  # fmt: skip
     budget.warm_up(scene, more, [spp])
     with tempfile.TemporaryDirectory() as folder:
@@ -134,8 +135,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         terminal.set_variant(options.variant)
         loaded = load.load_scene(options.scene, terminal.parse_size(options.size), terminal.parse_define(options.D))
-        specs = [load.parse_integrator(text) for text in options.integrator]
-        built = [(spec, *load.build_integrator(spec, loaded.carried)) for spec in specs]
+        specs = [parse_integrator(text) for text in options.integrator]
+        built = [(spec, *build_integrator(spec, loaded.carried)) for spec in specs]
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2

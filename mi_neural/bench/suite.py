@@ -27,6 +27,7 @@ from . import (
 )
 from . import reference as references
 from .load import InputError
+from .specs import IntegratorSpec, require_distinct
 from .workers import ClusterError, JobError, Workers
 
 #: Samples a pixel of references that are rendered, where nothing else is asked for.
@@ -49,7 +50,7 @@ class Settings:
     images           images made by other renderers
     """
 
-    specs: list[load.IntegratorSpec]
+    specs: list[IntegratorSpec]
     plan: benchmark.Plan
     keys: dict[str, object] = field(default_factory=dict)
     parameters: dict[str, str] = field(default_factory=dict)
@@ -100,7 +101,7 @@ class Suite:
         elsewhere.require_scenes(settings.images, collection.titles(files))
         # Images of one label are repeats of each other
         others = dict.fromkeys(image.label for image in settings.images)
-        load.require_distinct([*(spec.label for spec in settings.specs), *others], "the files")
+        require_distinct([*(spec.label for spec in settings.specs), *others], "the files")
         if len(files) > 1:
             known = {name for file in files for name in load.scene_parameters(file)}
             if unknown := [name for name in settings.parameters if name not in known]:

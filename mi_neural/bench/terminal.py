@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from mi_neural.bench import benchmark, budget, load, repeats, report
 from mi_neural.bench import reference as references
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import file_name
 from mi_neural.image import exr
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -250,7 +251,7 @@ def _write_image(path: Path, row: benchmark.Row, image, rendered: budget.Rendere
 def slug(row: benchmark.Row) -> str:
     """A file name for a row: nirc_cache_samples-8_steady_0.25s_denoised_2 (second repeat)."""
     parts = [
-        load.file_name(row.label),
+        file_name(row.label),
         row.mode,
         f"{row.budget_seconds:g}s" if row.budget_seconds else "",
         "denoised" if row.denoised else "",

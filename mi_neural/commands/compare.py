@@ -9,8 +9,9 @@ from typing import Annotated
 
 import typer
 
-from mi_neural.bench import benchmark, collection, denoise, elsewhere, load, report, suite, terminal
+from mi_neural.bench import benchmark, collection, denoise, elsewhere, report, suite, terminal
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import parse_integrator, parse_keys
 from mi_neural.bench.workers import connect
 from mi_neural.commands import options
 
@@ -111,9 +112,9 @@ def compare(
         repeats=repeats,
     )
     settings = suite.Settings(
-        specs=[load.parse_integrator(text) for text in integrator or ["path", "nirc"]],
+        specs=[parse_integrator(text) for text in integrator or ["path", "nirc"]],
         plan=plan,
-        keys=load.parse_keys(set_ or []),
+        keys=parse_keys(set_ or []),
         parameters=terminal.parse_define(define),
         sizes=terminal.parse_sizes(size),
         reference=reference,

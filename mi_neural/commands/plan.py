@@ -10,6 +10,7 @@ from rich.table import Table
 
 from mi_neural.bench import benchmark, load, terminal
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import parse_integrator, parse_keys
 from mi_neural.commands import options
 
 
@@ -27,10 +28,10 @@ def plan(
     json_: Annotated[bool, typer.Option("--json", help="print it as JSON")] = False,
 ) -> None:
     """Show what an integrator builds in SCENE, what it leaves out, and why. Nothing is rendered."""
-    spec = load.parse_integrator(integrator or "nirc")
+    spec = parse_integrator(integrator or "nirc")
     wanted_size, keys, parameters = (
         terminal.parse_size(size),
-        load.parse_keys(set_ or []),
+        parse_keys(set_ or []),
         terminal.parse_define(define),
     )
     terminal.set_variant(variant)

@@ -12,6 +12,7 @@ import typer
 from mi_neural.bench import benchmark, budget, cluster, denoise, environment, jobs, load, repeats, terminal
 from mi_neural.bench import reference as references
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import IntegratorSpec, parse_integrator, parse_keys
 from mi_neural.bench.workers import connect
 from mi_neural.commands import options
 from mi_neural.image import exr, moments
@@ -24,7 +25,7 @@ PREVIEW_SECONDS = 1.0
 class Wanted:
     """What was typed, as far as more than one step needs it; names as those of the options."""
 
-    spec: load.IntegratorSpec | None
+    spec: IntegratorSpec | None
     keys: dict[str, object]
     parameters: dict[str, str]
     size: tuple[int, int] | None
@@ -112,10 +113,10 @@ def render(
     check_budget(spp, seconds, until_error, pretrain, scheduler)
     wanted_size, keys, parameters = (
         terminal.parse_size(size),
-        load.parse_keys(set_ or []),
+        parse_keys(set_ or []),
         terminal.parse_define(define),
     )
-    spec = load.parse_integrator(integrator) if integrator else None
+    spec = parse_integrator(integrator) if integrator else None
     wanted = Wanted(
         spec, keys, parameters, wanted_size, spp, seconds, until_error, pretrain, seed, output, reference, denoise_,
         save_cache, load_cache, json_,

@@ -12,6 +12,7 @@ import typer
 from mi_neural.bench import benchmark, changes, cluster, denoise, environment, load, plots, terminal
 from mi_neural.bench import sequence as sequences
 from mi_neural.bench.load import InputError
+from mi_neural.bench.specs import parse_integrator, parse_keys
 from mi_neural.bench.workers import ClusterError, connect
 from mi_neural.commands import options
 
@@ -87,10 +88,10 @@ def sequence(
     if change_at is not None and not change:
         raise InputError("--change-at says when, but not what changes: add --change KEY=EXPR")
     functions = changes.parse(change or [], frames, change_at)
-    specs = [load.parse_integrator(text) for text in integrator or ["path", "nirc"]]
+    specs = [parse_integrator(text) for text in integrator or ["path", "nirc"]]
     wanted_size, keys, parameters = (
         terminal.parse_size(size),
-        load.parse_keys(set_ or []),
+        parse_keys(set_ or []),
         terminal.parse_define(define),
     )
     if denoise_:

@@ -14,7 +14,8 @@ PIXEL, FRAMES, PATHS = (60, 120), 300, 256
 
 def hemisphere(path: Path) -> None:
     """Incident light at a point: by the incident cache, by the outgoing cache, path-traced."""
-    from mi_neural.bench.load import IntegratorSpec, build_integrator, load_scene
+    from mi_neural.bench.load import load_scene
+    from mi_neural.bench.specs import IntegratorSpec, build_integrator
     from mi_neural.explore import pictures, views
 
     scene = load_scene("cornell_box").scene

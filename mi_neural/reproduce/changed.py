@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_neural.bench import benchmark, budget, load, sequence, sequence_pictures
-from mi_neural.bench.load import IntegratorSpec
+from mi_neural.bench.specs import IntegratorSpec
 from mi_neural.caches.reliability import correlation, covariance, variance
 from mi_neural.image import exr, metrics
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from mi_neural.bench import benchmark, budget, environment
 from mi_neural.bench import reference as references
-from mi_neural.bench.load import IntegratorSpec, LoadedScene
+from mi_neural.bench.load import LoadedScene
+from mi_neural.bench.specs import IntegratorSpec
 from mi_neural.image.metrics import TRIM_FRACTION, luminance, relative_weights
 
 from .work import Part, Work

@@ -10,9 +10,9 @@ from matplotlib.patches import Rectangle
 
 from mi_neural.bench import benchmark, budget, environment, load
 from mi_neural.bench.changes import rotate, rotated
-from mi_neural.bench.load import IntegratorSpec
 from mi_neural.bench.report import number
 from mi_neural.bench.sequence_pictures import CROP_COLOURS
+from mi_neural.bench.specs import IntegratorSpec
 from mi_neural.explore import figures
 from mi_neural.image import metrics
 
