@@ -162,20 +162,29 @@ def backward(integrator, scene, grad_in, sensor, seed, spp: int, by_cache: bool)
     # What the scene computes from its parameters (an environment map) is left for the end: its derivatives would go on
     # to them once, and those of later parts of a path or of later passes would be lost
     with dr.isolate_grad():
+        if area.box:  # the samples of a pixel count alike: one number of a pixel, however many samples it has
+            pixel = dr.arange(mi.UInt32, area.n_pixels)
+            δL = _of_samples(integrator, sensor, grad_in / spp, _middle(area, pixel), mi.Bool(True))
         for first, n in _passes(area, spp):
             samples, n_lanes = _samples(area, seed, first, n, spp)
-            place, active = _places(area, samples, n_lanes)
-            with dr.resume_grad():
-                δL = dr.zeros(mi.Spectrum, n_lanes)
-                dr.enable_grad(δL)
-                image = _image(integrator, sensor, [(place, δL, active)])
-                dr.set_grad(image, grad_in * (n / spp))
-                dr.enqueue(dr.ADMode.Backward, image)
-                dr.traverse(dr.ADMode.Backward)
-                δL = dr.grad(δL)
-            dr.eval(δL)
+            if not area.box:
+                δL = _of_samples(integrator, sensor, grad_in * (n / spp), *_places(area, samples, n_lanes))
             _trace_pass(integrator, dr.ADMode.Backward, scene, sensor, area, samples, n_lanes, δL, by_cache)
             dr.eval()
+
+
+def _of_samples(integrator, sensor, grad_in, place, active):
+    """Derivatives with respect to camera samples at `place` of a film that has these alone."""
+    with dr.resume_grad():
+        δL = dr.zeros(mi.Spectrum, dr.width(place))
+        dr.enable_grad(δL)
+        image = _image(integrator, sensor, [(place, δL, active)])
+        dr.set_grad(image, grad_in)
+        dr.enqueue(dr.ADMode.Backward, image)
+        dr.traverse(dr.ADMode.Backward)
+        δL = dr.grad(δL)
+    dr.eval(δL)
+    return δL
 
 
 def forward(integrator, scene, sensor, seed, spp: int, by_cache: bool):
@@ -206,9 +215,19 @@ def _places(area: Area, samples: Samples, n_lanes: int) -> tuple:
     """Where the camera samples of a pass lie on the film, with a box filter in the middle of their pixels, and which
     of them exist."""
     pixel, sample, active = samples.lanes(area, n_lanes)
-    within = mi.Point2f(0.5) if area.box else samples.sampler(pixel, sample, SALT).stratified_2d(0)
-    place = area.corner(pixel) + within
-    return place + mi.Point2f(*(float(v) for v in area.offset)), active & area.reaches(place)
+    if area.box:
+        return _middle(area, pixel), active
+    place = area.corner(pixel) + samples.sampler(pixel, sample, SALT).stratified_2d(0)
+    return place + _offset(area), active & area.reaches(place)
+
+
+def _middle(area: Area, pixel):
+    """Middle of a pixel, on the film."""
+    return area.corner(pixel) + mi.Point2f(0.5) + _offset(area)
+
+
+def _offset(area: Area):
+    return mi.Point2f(*(float(v) for v in area.offset))
 
 
 def _image(integrator, sensor, parts: list):
@@ -231,7 +250,11 @@ def _trace_pass(integrator, mode, scene, sensor, area: Area, samples: Samples, n
     def trace_pass(scene, sensor, lights, field, samples, δL):
         pixel, sample, active = samples.lanes(area, n_lanes)
         ray, weight, _, sampler = camera_rays(sensor, area, pixel, samples.sampler(pixel, sample, SALT))
-        δL = dr.zeros(mi.Spectrum, n_lanes) if δL is None else δL * weight
+        if δL is None:
+            δL = mi.Spectrum(0)
+        elif area.box:
+            δL = dr.gather(mi.Spectrum, δL, pixel, active)
+        δL = dr.zeros(mi.Spectrum, n_lanes) + δL * weight
         samples.scale_differentials(ray)
         δL = adjoint(held(), mode, scene, lights, field, sampler, ray, δL, active)
         return δL * weight if mode == dr.ADMode.Forward else None
