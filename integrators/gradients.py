@@ -39,6 +39,8 @@ from mi_neural.render.surface import scene_is_glossy, surface_of
 GRADIENTS = ("cache", "traced", "prb")
 #: Of the random numbers of adjoint paths, which are not those of the image.
 SALT = 0x3C6EF372
+#: Dimensions of the numbers that decide together where paths end, from here on one for each depth
+TOGETHER = 16
 
 
 def moved(scene, params, lamps: bool = False) -> list[str]:
@@ -342,7 +344,9 @@ def adjoint(integrator, mode, scene, lights, field, sampler, ray, δL, active):
             if field is None:
                 Lo += after.L * dr.select(dr.detach(f) > 0, f * dr.rcp(dr.detach(f)), 0)
             δL = _carry(mode, dr.select(path.active, Lo, 0), δL)
-        after, sampler = paths.roulette(after, sampler, integrator.rr_depth)
+        # Lanes of a packet end together, so that their queries do. Traced light has more noise if they do (measured)
+        u = None if field is None else sampler.together_1d(after.depth + TOGETHER)
+        after, sampler = paths.roulette(after, sampler, integrator.rr_depth, u=u)
         return after, δL, sampler
 
     return dr.while_loop(
