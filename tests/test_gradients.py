@@ -274,8 +274,8 @@ def assert_same_means(a, b, what: str) -> None:
     norm = np.linalg.norm(means[1])
     bound = stats.t.isf(each / 2, np.maximum(dof, 1)) * total**0.5 + 1e-6 * norm
     off = np.abs(means[0] - means[1])
-    print(f"{what}: {off.size} derivatives, noise {total.sum() ** 0.5 / norm:.2%} of the norm, "
-          f"worst {np.max(off / bound):.2f} of its bound, which is {np.linalg.norm(bound) / norm:.1%} for all")  # fmt: skip
+    print(f"{what}: {off.size} derivatives, noise {total.sum() ** 0.5 / norm:.2%} of the norm; the "
+          f"worst {np.max(off / bound):.2f} of its bound, all bounds {np.linalg.norm(bound) / norm:.1%}")  # fmt: skip
     assert (off <= bound).all()
 
 
