@@ -192,9 +192,11 @@ SHARED_KEYS = (
      * - gradient
        - |string|
        - How derivatives of images are computed (``dr.backward(mi.render(scene, params, integrator=...))``). ``cache``:
-         paths read the light at each vertex from the cache; little noise, and the bias of the cache. ``prb``:
-         Mitsuba's ``prb`` with the same ``max_depth``, ``rr_depth`` and ``hide_emitters``; unbiased. Derivatives of
-         shapes and sensors always use ``prb``. (Default: cache; in ``nirc_two_level`` prb)
+         paths read the light at each vertex from the cache; little noise, and the bias of the cache. ``traced``: the
+         light is traced by the rest of the path (path replay), with the lights that ``light_sampler`` chooses;
+         unbiased, and the cache is not used. ``prb``: Mitsuba's ``prb`` with the same ``max_depth``, ``rr_depth`` and
+         ``hide_emitters``; unbiased. Derivatives of shapes and sensors always use ``prb``. (Default: cache; in
+         ``nirc_two_level`` traced)
      * - seed
        - |int|
        - Seed of the initial weights and the training paths. (Default: 0)

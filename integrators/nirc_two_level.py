@@ -31,7 +31,7 @@ INNER = 2
 
 
 class NIRCTwoLevelIntegrator(IncidentIntegrator):
-    GRADIENT = "prb"
+    GRADIENT = "traced"
 
     def __init__(self, props):
         self.choice, self.mixed, self.compiling = None, None, False

@@ -8,19 +8,27 @@ parameter (a texture is one) the variance of one gradient and the squared bias a
 the reference, gradients by ``prb`` of many samples, whose own noise is subtracted. The efficiency is 1 / (variance x
 time), the first integrator's being 1: the geometric mean over the parameters of a kind. The error in a second is that
 of all parameters together, bias and noise, over their norm.
+
+``--memory`` measures memory in place of that, each integrator in a process of its own: how much more of it is resident
+at the peak of a gradient than before, in MiB. The scene is loaded, the cache trained, an image rendered and a gradient
+computed before, so that what stays and what compiling takes do not count. ``first`` is the same of the first gradient,
+compiling included, ``image`` of an image.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
+import subprocess
 import sys
+import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mi_neural.bench import environment, load, terminal
+from mi_neural.bench import environment, load, memory, terminal
 from mi_neural.bench.specs import build_integrator, parse_integrator
 from mi_neural.image import exr
 from mi_neural.render.kernels import work_seconds
@@ -171,6 +179,68 @@ def summary(rows: list[Row]) -> list[dict]:
     return lines
 
 
+def peak_over(work) -> float:
+    """MiB that are resident at the peak of a call over those before it."""
+    import drjit as dr
+
+    memory.start()
+    ctypes.CDLL(None).malloc_trim(0)  # what glibc keeps of freed memory would hide as much of the peak
+    if not memory.start():
+        raise load.InputError("this system does not count the peak of memory")
+    before = memory.peak_mib()
+    work()
+    dr.sync_thread()
+    return memory.peak_mib() - before
+
+
+def peaks(scene, integrator, spp: int, frames: int) -> dict:
+    """Of this process: MiB that an image, the first gradient and the third one take at their peak."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    def image():
+        with dr.suspend_grad():
+            dr.eval(mi.render(scene, integrator=integrator, spp=spp, seed=1))
+
+    if hasattr(integrator, "train"):
+        with dr.suspend_grad():
+            integrator.train(scene, frames)
+    image()
+    found = {"image": peak_over(image)}
+    params, keys = enable(scene)
+    shape = np.array(scene.sensors()[0].film().bitmap()).shape
+    loss = mi.TensorXf(np.full(shape, 1 / np.prod(shape), np.float32))
+    seeds = iter(range(3))
+
+    def gradient():
+        gradients(scene, params, keys, integrator, loss, spp, next(seeds))
+
+    found["first"] = peak_over(gradient)
+    gradient()
+    return {**found, "gradient": peak_over(gradient)}
+
+
+def each_alone(options) -> list[dict]:
+    """What :func:`peaks` says of each integrator, in a process of its own."""
+    lines = []
+    given = [options.scene, "--memory", "--size", options.size, "--variant", options.variant]
+    for name in ("spp", "frames", "max_depth"):
+        given += ["--" + name.replace("_", "-"), str(getattr(options, name))]
+    given += [word for text in options.D for word in ("-D", text)]
+    for label in options.integrator:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "one.json"
+            subprocess.run([sys.executable, *_flags(), __file__, *given, "-i", label, "-o", str(file)], check=True)
+            lines += json.loads(file.read_text(encoding="utf-8"))["lines"]
+    return lines
+
+
+def _flags() -> list[str]:
+    """The option of this interpreter that keeps the script's folder from being searched, where it was given."""
+    return ["-P"] if sys.flags.safe_path else []
+
+
 def main(arguments: list[str] | None = None) -> int:
     """The command."""
     parser = argparse.ArgumentParser(prog="python studies/gradients.py", description=__doc__)
@@ -184,8 +254,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--max-depth", type=int, default=-1, help="longest path; caches know no limit (default: -1)")
     parser.add_argument("-D", action="append", default=[], metavar="NAME=VALUE", help="parameters of the scene")
     parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--memory", action="store_true", help="measure memory in place of noise and time")
     parser.add_argument("-o", "--output", type=Path, help="JSON file")
     options = parser.parse_args(arguments)
+
+    if options.memory and len(options.integrator) > 1:
+        try:
+            lines = each_alone(options)
+        except subprocess.CalledProcessError as error:
+            return error.returncode
+        if options.output:
+            _write(options, lines, scene=options.scene)
+        return 0
 
     import mitsuba as mi
 
@@ -196,9 +276,18 @@ def main(arguments: list[str] | None = None) -> int:
         carried = {**loaded.carried, "max_depth": options.max_depth}
         specs = [parse_integrator(text) for text in options.integrator]
         integrators = {s.label: build_integrator(s, carried)[0] for s in specs}
+        if options.memory:
+            (label, integrator), *_ = integrators.items()
+            line = {"integrator": label, **peaks(loaded.scene, integrator, options.spp, options.frames)}
     except load.InputError as error:
         print(error, file=sys.stderr)
         return 2
+    if options.memory:
+        print("{integrator}: gradient {gradient:.0f} MiB, first {first:.0f}, image {image:.0f}".format(**line),
+              flush=True)  # fmt: skip
+        if options.output:
+            _write(options, [line], scene=loaded.name)
+        return 0
     rows, used, left_out = measure(
         loaded.scene, integrators, carried, options.spp, options.rounds, options.frames, options.reference
     )
@@ -210,12 +299,16 @@ def main(arguments: list[str] | None = None) -> int:
               f"(median {line['bias_median']:.3f}), error in 1 s {line['error_1s']:.3f}; efficiency {efficiency}",
               flush=True)  # fmt: skip
     if options.output:
-        exr.write_text(options.output, json.dumps({
-            "scene": loaded.name, "size": options.size, "spp": options.spp, "rounds": options.rounds,
-            "frames": options.frames, "max_depth": options.max_depth, "lines": lines,
-            "rows": [asdict(r) for r in rows], "left_out": left_out, "environment": environment.describe()},
-            indent=1, default=str))  # fmt: skip
+        _write(options, lines, scene=loaded.name, rounds=options.rounds, rows=[asdict(r) for r in rows],
+               left_out=left_out)  # fmt: skip
     return 0
+
+
+def _write(options, lines: list[dict], **more) -> None:
+    """The JSON file."""
+    keys = {name: getattr(options, name) for name in ("size", "spp", "frames", "max_depth")}
+    exr.write_text(options.output, json.dumps(
+        {**more, **keys, "lines": lines, "environment": environment.describe()}, indent=1, default=str))  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -160,13 +160,26 @@ def test_gradients_of_the_study_are_read(results, tmp_path):
     for k, scene in enumerate(("cornell-box", "veach-ajar", "living-room")):
         lines = [{"integrator": name, "seconds": 0.1, "bias": 0.01 * n,
                   "efficiency": {"colours": 1.0 + n, "others": 2.0 + k, **({"emitters": 1.44} if k < 2 else {})}}
-                 for n, name in enumerate(("prb", "nirc", "nrc"))]  # fmt: skip
+                 for n, name in enumerate(("prb", "nirc", "nrc", "nirc_two_level"))]  # fmt: skip
         text = json.dumps({"scene": scene, "spp": 8, "lines": lines, "rows": [], "environment": ENVIRONMENT})
         (tmp_path / f"{scene}.json").write_text(text, encoding="utf-8")
     table = of(results, "gradients")
     results.fill(table, results.collected(tmp_path, "*.json", "lines"), "abc1234", None)
-    assert table["rows"][1][1:] == [["2.0", "3.0"], ["3.0", "3.0"], ["1.4", "1.4"], ["0.010", "0.020"]]
-    assert table["rows"][2][1:] == [["2.0", "3.0"], ["4.0", "4.0"], "", ["0.010", "0.020"]]
+    first = ["2.0", "3.0", "4.0"]
+    assert table["rows"][1][1:] == [first, ["3.0"] * 3, ["1.4"] * 3, ["0.010", "0.020", "0.030"]]
+    assert table["rows"][2][1:] == [first, ["4.0"] * 3, "", ["0.010", "0.020", "0.030"]]
+
+
+def test_memory_of_gradients_of_the_study_is_read(results, tmp_path):
+    """As `studies/gradients.py --memory` writes it, a file a scene."""
+    table = of(results, "gradients_memory")
+    for k, scene in enumerate(("cornell-box", "living-room")):
+        lines = [{"integrator": name, "image": 1.0, "first": 2.0, "gradient": 10.0 * k + n + 0.2}
+                 for n, name in enumerate(("prb", "nirc", "nrc", "nirc_two_level"))]  # fmt: skip
+        text = json.dumps({"scene": scene, "lines": lines, "environment": ENVIRONMENT})
+        (tmp_path / f"{scene}.json").write_text(text, encoding="utf-8")
+    results.fill(table, results.collected(tmp_path, "*.json", "lines"), "abc1234", None)
+    assert [row[1:] for row in table["rows"]] == [["0", "1", "2", "3"], ["10", "11", "12", "13"]]
 
 
 def test_figures_of_a_gpu_are_read(results, tmp_path):
