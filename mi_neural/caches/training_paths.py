@@ -188,7 +188,7 @@ class Vertices:
         flights = dr.zeros(mi.Color3f, size) if arriving else None
         return cls(empty_surfaces(size, in_media), *colours, direction, smooth, stops, pdf, flights)
 
-    def keep(self, i, place: Callable, found: paths.Bounce, terminal, surface, inside=None) -> None:
+    def keep(self, i, place: Callable, found: paths.Bounce, terminal, receives, surface, inside=None) -> None:
         """Write entries `i`; `surface` is None where only positions and normals of surfaces are wanted, which `place()`
         gives, `inside` where there are no media."""
         dr.scatter(self.emitted, found.Le, i)
@@ -209,7 +209,7 @@ class Vertices:
             dr.scatter(self.records.inside, inside, i)
         dr.scatter(self.records.valid, terminal, i)
         dr.scatter(self.direction, found.ray.d, i)
-        dr.scatter(self.smooth, terminal & found.traced & ~found.delta, i)
+        dr.scatter(self.smooth, receives & found.traced & ~found.delta, i)
 
 
 @dataclass
@@ -248,8 +248,8 @@ class _Tracer:
             terminal = self.walk_on.terminal(path, path.active)
             surface = self.surface(path, path.active) if plan.surfaces else None
             found, sampler = self.bounce(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
-            here = partial(self.walk_on.place, path)
-            vertices.keep(i, here, found, terminal, surface, self.walk_on.inside(path))
+            here, receives = partial(self.walk_on.place, path), self.walk_on.receives(path, path.active, terminal)
+            vertices.keep(i, here, found, terminal, receives, surface, self.walk_on.inside(path))
             if plan.densities:
                 dr.scatter(vertices.pdf, found.pdf, i)
             before, path = path, self.walk_on.advance(UNLIMITED, path, found)

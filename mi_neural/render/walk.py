@@ -75,6 +75,10 @@ class SurfaceWalk:
         """Whether a path may end in a cache where it stands."""
         return vertex.is_terminal(path.si, active)
 
+    def receives(self, path, active, terminal):
+        """Whether a cache of incident light learns what arrives where a path stands, which is `terminal` or not."""
+        return terminal
+
     def place(self, path) -> tuple:
         """Where a path stands: (position, normal on the side that it came from)."""
         return path.si.p, vertex.facing(path.si)
@@ -164,6 +168,11 @@ class MediaWalk(SurfaceWalk):
         if not self.windows:
             smooth &= ~(path.si.is_medium_transition() & vertex.transmits(path.si.bsdf()))
         return active & (path.scattered | smooth)
+
+    def receives(self, path, active, terminal):
+        """Also at surfaces that let a part of the light pass: what arrives there is learned as elsewhere. Without that
+        the image of a half open shell full of fog is 3 % too bright where the cache answers at its first vertex."""
+        return active & (path.scattered | vertex.is_smooth(path.si, active)) if self.windows else terminal
 
     def place(self, path):
         normal = dr.select(path.scattered, path.ray.d, vertex.facing(path.si))
