@@ -344,7 +344,7 @@ NIRCIntegrator.__doc__ = (
     Neural incident radiance cache (:monosp:`nirc`)
     -----------------------------------------------
 
-    Estimates all light with little noise and a small bias: at the first surface that is not a mirror, direct light is
+    Estimates all light with little noise and a small bias: at the first vertex that is no mirror, direct light is
     traced as in ``path`` (next-event estimation and BSDF rays, weighted against each other; environment included), and
     light that was reflected before is read from a network trained while rendering, which knows the incident radiance
     :math:`L(x, \omega)` (Dereviannykh et al. 2025, "Neural Two-Level Monte Carlo Real-Time Rendering", eq. for the
@@ -407,12 +407,18 @@ NIRCIntegrator.__doc__ = (
     frame's records is ``reliability`` in the statistics. ``depth``: mean length of paths in segments, those that find
     direct light alone not counted.
 
-    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``neural_path``), polarization, spectral rendering, and a limit to the number of bounces
-    inside the cache (use ``path``). Light of very bright places shows through thin walls until some 300 frames were
+    In participating media the first vertex may be a point where a medium scatters. All values of ``termination`` work
+    there: the phase function stands in the place of :math:`f \cos\theta`. :math:`L_{cache}(x, \omega)` contains what the
+    medium between x and the next surface absorbs and scatters. The light that comes from emitters in a straight line is
+    not in it. Training paths run on to their natural end there. Rays are only saved where a path stops if no surface in
+    the scene lets a part of the light pass (masks). Measured: ``mi-neural doc media``.
+
+    *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
+    out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
+    polarization, spectral rendering, and a limit to the number of bounces inside the cache (use ``path``). Light of very bright places shows through thin walls until some 300 frames were
     trained (use ``termination="spread"``).
 
-    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
 
     .. tabs::
