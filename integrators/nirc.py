@@ -408,15 +408,16 @@ NIRCIntegrator.__doc__ = (
     direct light alone not counted.
 
     In participating media the first vertex may be a point where a medium scatters. All values of ``termination`` work
-    there: the phase function stands in the place of :math:`f \cos\theta`. :math:`L_{cache}(x, \omega)` contains what the
-    medium between x and the next surface absorbs and scatters. The light that comes from emitters in a straight line is
-    not in it. Training paths run on to their natural end there. Rays are only saved where a path stops if no surface in
-    the scene lets a part of the light pass (masks). Measured: ``mi-neural doc media``.
+    there: the phase function stands in the place of :math:`f \cos\theta`. :math:`L_{cache}(x, \omega)` is the light that
+    arrives at x through the medium: what it absorbs and scatters on the way is taken into account. The light that comes
+    from emitters in a straight line is not in it. Training paths run on to their natural end there. Where surfaces let
+    a part of the light pass (masks), a path that stops traces a ray for direct light. In frames ``nrc`` and
+    ``neural_path`` have less error in media: ``mi-neural doc media``.
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
-    polarization, spectral rendering, and a limit to the number of bounces inside the cache (use ``path``). Light of very bright places shows through thin walls until some 300 frames were
-    trained (use ``termination="spread"``).
+    polarization, spectral rendering, and a limit to the number of bounces inside the cache (use ``path``). Light of
+    very bright places shows through thin walls until some 300 frames were trained (use ``termination="spread"``).
 
     Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
