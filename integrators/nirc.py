@@ -408,11 +408,11 @@ NIRCIntegrator.__doc__ = (
     direct light alone not counted.
 
     In participating media the first vertex may be a point where a medium scatters. All values of ``termination`` work
-    there: the phase function stands in the place of :math:`f \cos\theta`. :math:`L_{cache}(x, \omega)` is the light that
-    arrives at x through the medium: what it absorbs and scatters on the way is taken into account. The light that comes
-    from emitters in a straight line is not in it. Training paths run on to their natural end there. Where surfaces let
-    a part of the light pass (masks), a path that stops traces a ray for direct light. In frames ``nrc`` and
-    ``neural_path`` have less error in media: ``mi-neural doc media``.
+    there: the phase function stands in the place of :math:`f \cos\theta`. :math:`L_{cache}(x, \omega)` is the light
+    that arrives at x through the medium: what it absorbs and scatters on the way is taken into account. The light that
+    comes from emitters in a straight line is not in it. Training paths run on to their natural end there. Where
+    surfaces let a part of the light pass (masks), a path that stops traces a ray for direct light. In frames ``nrc``
+    and ``neural_path`` have less error in media: ``mi-neural doc media``.
 
     *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
     out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
