@@ -20,8 +20,8 @@ FILM_VALUES = 16
 
 #: What renders participating media.
 WITH_MEDIA = (
-    'media are not modelled by it; use <integrator type="plain_path"/> or <integrator type="neural_path"/>, with a '
-    'light sampler or without, or <integrator type="volpath"/>'
+    'media are not modelled by it; use <integrator type="plain_path"/>, "neural_path", "nrc" or "nirc", with a light '
+    'sampler or without, or "volpath"'
 )
 
 

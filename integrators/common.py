@@ -23,6 +23,7 @@ from mi_neural.render.binding import BoundScene
 from mi_neural.render.film import Area, recordable
 from mi_neural.render.frozen import locked, undisturbed
 from mi_neural.render.sampling import PathSampler
+from mi_neural.render.walk import SURFACES, MediaWalk
 
 #: Frames that `train_frames = -1` trains at least and at most.
 SETTLE_FRAMES = (128, 400)
@@ -80,9 +81,12 @@ class CacheIntegrator(LearningIntegrator):
     GRADIENT = "cache"
     #: Whether the plan may choose a light sampler where none is nested.
     CHOOSES_LIGHTS = False
+    #: Whether paths may end at rough glass around a medium.
+    ENDS_AT_WINDOWS = False
 
     def __init__(self, props):
         super().__init__(props)
+        self.walk = SURFACES
         self.train_steps = props.get("train_steps", 1)
         self.freeze_cache = props.get("freeze_cache", False)
         self.gradient = props.get("gradient", self.GRADIENT)
@@ -195,6 +199,23 @@ class CacheIntegrator(LearningIntegrator):
                     self._train_first(scene, view)
                 else:
                     self.cache.train(scene, view, self.state.lights, frames=self.train_steps)
+
+    def bind_media(self, scene, sensor, bound: BoundScene) -> None:
+        known_media, known_camera, forgotten = self.media, self.camera_medium_id, self.film_state.n_forgotten
+        super().bind_media(scene, sensor, bound)
+        self.check_media()
+        another = self.media is not known_media or self.camera_medium_id != known_camera
+        if another or (self.media is not None and self.film_state.n_forgotten > forgotten):
+            self.walk = SURFACES
+            if self.media is not None:
+                self.walk = MediaWalk(self.media, self.camera_medium, self.ENDS_AT_WINDOWS)
+            self.cache.walk = self.walk
+            if self.media is not known_media:
+                self.cache.forget_media()
+            self.cache.clear_recordings()
+
+    def check_media(self) -> None:
+        """Refuse settings that cannot be kept where the bound scene has participating media."""
 
     def _begin(self, scene, is_another: bool) -> None:
         """Begin with a scene: refuse it, or see what it is."""

@@ -11,7 +11,7 @@ import numpy as np
 from mi_neural import plan
 from mi_neural.caches.blend import sigma_channels
 from mi_neural.caches.incident import IncidentCache
-from mi_neural.caches.material import material_of
+from mi_neural.caches.material import material_at
 from mi_neural.caches.outgoing import OutgoingCache
 from mi_neural.caches.sh_grid import HarmonicCache
 from mi_neural.caches.spatial_hash import SpatialHashCache
@@ -49,6 +49,8 @@ class Traced:
 
 class NIRCIntegrator(IncidentIntegrator):
     CHOOSES_LIGHTS = True
+    renders_media = True
+    ENDS_AT_WINDOWS = True
 
     def __init__(self, props):
         super().__init__(props)
@@ -107,6 +109,7 @@ class NIRCIntegrator(IncidentIntegrator):
         self._check(fits, f"use_cache() takes an IncidentCache or a class of your own derived from it; got "
                     f"{type(cache).__name__}")  # fmt: skip
         self.cache = cache
+        self.cache.walk = self.walk
         self.given["cache"] = type(cache).__name__
         self.state.plan = None
         self.film_state.passes.clear()
@@ -141,11 +144,10 @@ class NIRCIntegrator(IncidentIntegrator):
         lane = dr.arange(mi.UInt32, n)
         sampler = PathSampler.make(lane, mi.UInt32(0xD1DEC7), index=lane, scramble=mi.UInt32(1))
         ray = film_rays(sensor, sampler.stratified_2d(0), sampler)
-        path = paths.camera_vertex(self, scene, ray, mi.Bool(True))
-        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
+        path, sampler = self.walk.first_vertex(self, scene, ray, sampler, mi.Bool(True))
 
         def once(k, mean, square, sampler):
-            found, sampler = paths.bounce(scene, lights, path, sampler)
+            found, sampler = self.walk.bounce(self, scene, lights, path, sampler)
             direct = dr.mean(vertex.finite(path.β * found.direct, path.active))
             return k + 1, mean + 0.25 * direct, square + 0.25 * dr.square(direct), sampler
 
@@ -181,24 +183,23 @@ class NIRCIntegrator(IncidentIntegrator):
         """E[L] = Le + direct + ∫ f [L_cache + u (L_gather - L_cache)] cos dω, with the share u(ω) of `gather_share`, or
         that of a path that stops in the cache."""
         (setting,) = settings
-        path = paths.camera_vertex(self, scene, ray, active)
-        path, sampler = paths.follow_mirrors(scene, path, sampler, self.depth_limit, self.rr_depth)
-        si, active, n_light = path.si, path.active, self.n_light
-        bsdf = si.bsdf(path.ray)
+        path, sampler = self.walk.first_vertex(self, scene, ray, sampler, active)
+        active, n_light = path.active, self.n_light
+        bsdf = path.si.bsdf(path.ray)
         if self.one_path and self.cached(field):
             by_chance = self.termination == "balanced"
             rule = stopping.ByChance(self.cache_samples) if by_chance else stopping.WhereWide(setting)
             return stopping.estimate(self, scene, lights, field, path, sampler, rule)
         features = None
         if self.cached(field):
-            features = field.encode(si.p, vertex.facing(si), **material_of(field, si, bsdf, active))
+            features = field.encode(*self.walk.place(path), **material_at(field, self.walk, path, bsdf, active))
 
         # ---------------- Samples with a ray: direct light, and what the ray meets ----------------
         traced, cache, sampler = self.traced_samples(scene, lights, field, features, path, bsdf, setting, sampler)
 
         # -------------------------- Samples of the cache without a ray ----------------------------
         if features is not None:
-            more, sampler = self.cache_samples_only(field, features, si, bsdf, sampler, active)
+            more, sampler = self.cache_samples_only(field, features, path, bsdf, sampler)
             cache = (cache + more) / max(self.cache_samples, n_light)
         direct, residual = traced.direct / n_light, traced.residual / n_light
         L = path.L + dr.select(active, path.β * (direct + cache + residual), 0)
@@ -206,7 +207,7 @@ class NIRCIntegrator(IncidentIntegrator):
 
         channels = {"direct": path.β * direct, "cache": path.β * cache, "residual": path.β * residual}
         channels |= {"depth": path.depth + mi.Float(traced.n_rays) / n_light}
-        channels |= sigma_channels(field if features is not None else None, si.p, vertex.facing(si))
+        channels |= sigma_channels(field if features is not None else None, *self.walk.place(path))
         return L, coverage, {k: dr.select(active, v, 0) for k, v in channels.items()}
 
     def cached(self, field) -> bool:
@@ -215,34 +216,33 @@ class NIRCIntegrator(IncidentIntegrator):
 
     def traced_samples(self, scene, lights, field, features, path, bsdf, mixture, sampler):
         """Sums over `n_light` BSDF samples that are traced: (:class:`Traced`, the cache's predictions, sampler)."""
-        si, active, n_light = path.si, path.active, self.n_light
+        walk, active, n_light = self.walk, path.active, self.n_light
         here = replace(path, L=mi.Color3f(0), β=mi.Color3f(1), η=mi.Float(1))
-        a_0 = spread.camera_spread(dr.square(path.length), dr.dot(si.n, path.ray.d))
+        a_0 = walk.camera_spread(path)
         # Of these samples, so many gather what lies far: as few as the share allows, to save the others their rays
         n_gather = dr.clip(dr.ceil(mixture * n_light), 1, n_light)
 
         def sample(i, traced, cache, sampler):
             numbers = paths.stratified(sampler, n_light, i)
-            found, sampler = paths.bounce(scene, lights, here, sampler, numbers, bsdf=bsdf)
+            found, sampler = walk.bounce(self, scene, lights, here, sampler, numbers, bsdf)
             Li_cache = mi.Color3f(0)
             if features is not None:
-                smooth = found.followed & ~found.delta
-                Li_cache = dr.select(smooth, found.weight * field.query(features, found.ray.d), 0)
+                smooth = found.traced & ~found.delta
+                Li_cache = dr.select(smooth, found.turn * field.query(features, found.ray.d), 0)
 
             # ------------------ Reflection by what the ray met --------------------
-            cos_theta = dr.dot(found.si.n, found.ray.d)
-            width = dr.select(found.delta, 0, spread.segment_spread(found.si.t**2, found.bs.pdf, cos_theta))
+            width = walk.segment_spread(here, found)
             far = dr.select(mi.Float(i) < n_gather, mixture * n_light / n_gather, 0)
             share = mi.Float(1)
             if features is not None:
-                share = self.gather_share(found.delta, found.bs.pdf, width, a_0, far)
-            beyond = replace(paths.advance(here, found, self.depth_limit), L=mi.Color3f(0))
+                share = self.gather_share(found.delta, found.pdf, width, a_0, far)
+            beyond = replace(walk.advance(self, here, found), L=mi.Color3f(0))
             beyond.active &= share > 0
             follows = mi.Bool(beyond.active)
             beyond, n_rays, sampler = self.gather(scene, lights, field, sampler, beyond, width, a_0, path.β)
             return i + 1, Traced(
                 traced.direct + found.direct,
-                traced.residual + dr.select(found.followed, share * (beyond.L - Li_cache), 0),
+                traced.residual + dr.select(found.traced, share * (beyond.L - Li_cache), 0),
                 traced.n_rays + dr.select(follows, n_rays + 1, 0),
                 traced.covered + dr.select(beyond.valid, 1, 0),
             ), cache + Li_cache, sampler
@@ -254,21 +254,20 @@ class NIRCIntegrator(IncidentIntegrator):
         )  # fmt: skip
         return traced, cache, sampler
 
-    def cache_samples_only(self, field, features, si, bsdf, sampler, active):
+    def cache_samples_only(self, field, features, path, bsdf, sampler):
         """Sum of the cache's predictions in the directions that are not traced: (sum, sampler)."""
         n = max(self.cache_samples - self.n_light, 0)
         if n == 0:
             return mi.Color3f(0), sampler
 
         def sample(i, cache, sampler):
-            bs, weight, delta = paths.sample_bsdf(
-                si, bsdf, sampler.stratified_1d(EXTRA_LOBE, n, i), sampler.stratified_2d(EXTRA, n, i), active
-            )
-            answer = weight * field.query(features, si.to_world(bs.wo))
-            return i + 1, cache + dr.select(delta, 0, answer), sampler
+            lobe, direction = sampler.stratified_1d(EXTRA_LOBE, n, i), sampler.stratified_2d(EXTRA, n, i)
+            turn = self.walk.sample(path, bsdf, lobe, direction)
+            answer = turn.weight * field.query(features, turn.d)
+            return i + 1, cache + dr.select(turn.delta, 0, answer), sampler
 
         _, cache, sampler = dr.while_loop(
-            (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, *_: active & (i < n), sample, label="cache samples"
+            (mi.UInt32(0), mi.Color3f(0), sampler), lambda i, *_: path.active & (i < n), sample, label="cache samples"
         )
         return cache, sampler
 
@@ -294,30 +293,30 @@ class NIRCIntegrator(IncidentIntegrator):
         tracing up to there. `width`: square root of the path's spread. `β_first`: throughput up to where `path` began.
         Returns (path, rays that were traced for more than direct light, sampler).
         """
-        cached = self.cached(field)
+        cached, walk = self.cached(field), self.walk
 
         def step(path, width, n_rays, sampler):
-            si = path.si
             wide = mi.Bool(False)
             if cached:
-                wide = vertex.is_terminal(si, path.active) & spread.exceeds(width, a_0, self.spread_threshold)
+                wide = walk.terminal(path, path.active) & spread.exceeds(width, a_0, self.spread_threshold)
 
             def stops(pdf):
                 return wide & (pdf <= SHARP_PDF)
 
-            # Next-event estimation shares the work only with rays that are followed
-            found, sampler = paths.bounce(
-                scene, lights, path, sampler, follow=lambda bs, delta: delta | ~stops(bs.pdf), alone=stops
-            )
-            after = paths.advance(path, found, self.depth_limit)
+            # Next-event estimation shares the work only with rays that are followed. What shines through a mask
+            # competes with it at later vertices, too, so that in scenes with masks and media all rays are
+            how = {} if walk.may_stay else {"follow": lambda bs, delta: delta | ~stops(bs.pdf), "alone": stops}
+            found, sampler = walk.bounce(self, scene, lights, path, sampler, **how)
+            after = walk.advance(self, path, found)
             if cached:
-                stop = stops(found.bs.pdf) & ~found.delta
-                more = material_of(field, si, si.bsdf(path.ray), stop)
-                Li_cache = field.query(field.encode(si.p, vertex.facing(si), **more), found.ray.d)
-                after.L += dr.select(stop, path.β * found.weight * Li_cache, 0)
-            cos_theta = dr.dot(found.si.n, found.ray.d)
-            width += dr.select(found.delta, 0, spread.segment_spread(found.si.t**2, found.bs.pdf, cos_theta))
-            after, sampler = paths.roulette(after, sampler, self.rr_depth, β_first)
+                stop = stops(found.pdf) & ~found.delta
+                more = material_at(field, walk, path, path.si.bsdf(path.ray), stop)
+                Li_cache = field.query(field.encode(*walk.place(path), **more), found.ray.d)
+                after.L += dr.select(stop, path.β * found.turn * Li_cache, 0)
+                if walk.may_stay:
+                    after.active &= ~stop
+            width += walk.segment_spread(path, found)
+            after, sampler = paths.roulette(after, sampler, self.rr_depth + walk.later, β_first)
             return after, width, n_rays + dr.select(after.active, 1, 0), sampler
 
         path, _, n_rays, sampler = dr.while_loop(
@@ -345,7 +344,7 @@ NIRCIntegrator.__doc__ = (
     Neural incident radiance cache (:monosp:`nirc`)
     -----------------------------------------------
 
-    Estimates all light with little noise and a small bias: at the first surface that is not a mirror, direct light is
+    Estimates all light with little noise and a small bias: at the first vertex that is no mirror, direct light is
     traced as in ``path`` (next-event estimation and BSDF rays, weighted against each other; environment included), and
     light that was reflected before is read from a network trained while rendering, which knows the incident radiance
     :math:`L(x, \omega)` (Dereviannykh et al. 2025, "Neural Two-Level Monte Carlo Real-Time Rendering", eq. for the
@@ -408,12 +407,19 @@ NIRCIntegrator.__doc__ = (
     frame's records is ``reliability`` in the statistics. ``depth``: mean length of paths in segments, those that find
     direct light alone not counted.
 
-    *Works with* all surfaces and emitters of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves out*
-    participating media (use ``neural_path``), polarization, spectral rendering, and a limit to the number of bounces
-    inside the cache (use ``path``). Light of very bright places shows through thin walls until some 300 frames were
-    trained (use ``termination="spread"``).
+    In participating media the first vertex may be a point where a medium scatters. All values of ``termination`` work
+    there: the phase function stands in the place of :math:`f \cos\theta`. :math:`L_{cache}(x, \omega)` is the light
+    that arrives at x through the medium: what it absorbs and scatters on the way is taken into account. The light that
+    comes from emitters in a straight line is not in it. Training paths run on to their natural end there. Where
+    surfaces let a part of the light pass (masks), a path that stops traces a ray for direct light. In frames ``nrc``
+    and ``neural_path`` have less error in media: ``mi-neural doc media``.
 
-    Errors: ``ValueError`` for a key out of range, a scene without emitters, sensors or with media;
+    *Works with* all surfaces, emitters and media of Mitsuba, RGB variants ``llvm_ad_rgb`` and ``cuda_ad_rgb``. *Leaves
+    out* phase functions of microflakes (``sggx``: use ``volpath``), gradients in media (use ``prbvolpath``),
+    polarization, spectral rendering, and a limit to the number of bounces inside the cache (use ``path``). Light of
+    very bright places shows through thin walls until some 300 frames were trained (use ``termination="spread"``).
+
+    Errors: ``ValueError`` for a key out of range, a scene without emitters or sensors;
     :class:`~mi_neural.caches.field.CacheFileError` for cache files.
 
     .. tabs::

@@ -12,7 +12,6 @@ from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining
 from mi_neural.integrators import gradients
 from mi_neural.integrators.common import CacheIntegrator
-from mi_neural.render.walk import SURFACES, MediaWalk
 
 #: The constants of a training step in the words of the plugins' keys
 KEYS = {"world_share": "world_share", "suffix": "train_suffix", "content": "cache_content",
@@ -56,7 +55,6 @@ class OutgoingIntegrator(CacheIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.walk = SURFACES
         self.spread_threshold = props.get("spread_threshold", 0.01)
         self.unbounded_in_media = props.get("unbounded_share", self.default_unbounded_in_media(props))
         self._check(self.spread_threshold >= 0, f"spread_threshold is {self.spread_threshold}; it must be 0 or more")
@@ -90,19 +88,15 @@ class OutgoingIntegrator(CacheIntegrator):
             raise ValueError(f"{self.plugin}: {message}") from None
 
     def bind_media(self, scene, sensor, bound) -> None:
-        known_media, known_camera, forgotten = self.media, self.camera_medium_id, self.film_state.n_forgotten
+        known = self.walk
         super().bind_media(scene, sensor, bound)
-        self._check(self.media is None or self.cache.training.roughening == 0,
-                    "roughening works in scenes without participating media; leave it out")  # fmt: skip
-        another = self.media is not known_media or self.camera_medium_id != known_camera
-        if another or (self.media is not None and self.film_state.n_forgotten > forgotten):
-            self.walk = SURFACES if self.media is None else MediaWalk(self.media, self.camera_medium)
+        if self.walk is not known:
             share = self.outgoing_keys["unbounded_share"] if self.media is None else self.unbounded_in_media
             self.cache.training = replace(self.cache.training, unbounded_share=share)
-            self.cache.walk = self.walk
-            if self.media is not known_media and self.cache.field is not None:
-                self.cache.field.places.forget_media()  # their numbers are of other media
-            self.cache.clear_recordings()
+
+    def check_media(self) -> None:
+        self._check(self.media is None or self.cache.training.roughening == 0,
+                    "roughening works in scenes without participating media; leave it out")  # fmt: skip
 
     def default_paths(self) -> int:
         return OutgoingTraining.usual_paths()

@@ -8,11 +8,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_neural.caches.blend import sigma_channels
-from mi_neural.caches.material import material_of, needs_material
+from mi_neural.caches.material import material_at, needs_material
 from mi_neural.estimators import spread
 from mi_neural.estimators.spread import SHARP_PDF, PathSpread
 from mi_neural.render import path as paths
-from mi_neural.render import vertex
 from mi_neural.render.kernels import end_kernel
 
 
@@ -40,7 +39,7 @@ class ByChance:
         """Probability with which a ray of density `pdf` is followed."""
         return spread.follow_probability(self.n_cache, pdf)
 
-    def wide(self, path, spread):
+    def wide(self, walk, path, spread):
         """What else that depends on."""
         return mi.Bool(False)
 
@@ -55,67 +54,74 @@ class WhereWide:
     def keep(self, pdf, wide):
         return dr.select(wide & (pdf <= SHARP_PDF), 0, mi.Float(1))
 
-    def wide(self, path, spread):
-        return vertex.is_terminal(path.si, path.active) & spread.exceeds(self.threshold)
+    def wide(self, walk, path, spread):
+        return walk.terminal(path, path.active) & spread.exceeds(self.threshold)
 
 
-class Thinned(paths.Surface):
-    """A surface whose BSDF rays are followed with the probability ``keep(pdf)``: their density is so much less."""
+class Thinned:
+    """A place whose BSDF rays are followed with the probability ``keep(pdf)``: their density is so much less.
 
-    def __init__(self, path, bsdf, found, keep):
-        super().__init__(path, bsdf, found)
-        self.keep = keep
+    In all else what it is made of: a :class:`.path.Surface`, or a :class:`.media.Place`."""
+
+    def __init__(self, place, keep):
+        self.place, self.keep = place, keep
+
+    def __getattr__(self, name):
+        return getattr(self.place, name)
 
     def pdf(self):
-        pdf = super().pdf()
+        pdf = self.place.pdf()
         return pdf * self.keep(pdf)
 
     def eval_pdf(self, d, active):
-        f, pdf = super().eval_pdf(d, active)
+        f, pdf = self.place.eval_pdf(d, active)
         return f, pdf * self.keep(pdf)
 
 
 def estimate(integrator, scene, lights, field, path, sampler, rule):
-    """A path that stops as the `rule` says, by what an integrator's `estimate` returns; `path` is at its first surface.
+    """A path that stops as the `rule` says, by what an integrator's `estimate` returns; `path` is at its first vertex.
 
     Mirror lobes are always followed. Where the path stops no ray is traced, and the cache answers for the direction of
-    the BSDF sample. Direct light is estimated at each vertex. Its BSDF rays have the density p_g keep(p_g).
+    the BSDF sample. Direct light is estimated at each vertex. Its BSDF rays have the density p_g keep(p_g). Where media
+    lie behind surfaces that let a part of the light pass, what shines through these competes with light samples at
+    later vertices, too: all rays are traced then.
     """
-    first = paths.stratified(sampler)
+    first, walk = paths.stratified(sampler), integrator.walk
+    traces_all = walk.may_stay
 
     def step(path, end, spread, direct_first, is_first, sampler):
         numbers, sampler = paths.draw_numbers(sampler)
         numbers = dr.select(is_first, first, numbers)
-        wide = rule.wide(path, spread)
+        wide = rule.wide(walk, path, spread)
 
         def keep(pdf):
             return rule.keep(pdf, wide)
 
-        def direct(scene, lights, path, bsdf, found, numbers, sampler, alone=None):
-            here = Thinned(path, bsdf, found, keep)
+        def direct(scene, lights, path, bsdf, found, numbers, sampler, alone=None, here=None):
+            here = Thinned(here or paths.Surface(path, bsdf, found), keep)
             L_nee, Le, sampler = paths.direct_light(scene, lights, path, bsdf, found, numbers, sampler, alone, here)
-            share = dr.select(found.followed & ~found.delta, keep(found.bs.pdf), 1)  # not 0: the ray was followed
+            share = dr.select(found.followed & ~found.delta, keep(found.pdf), 1)  # not 0: the ray was followed
             return L_nee, Le / share, sampler
 
         bsdf = path.si.bsdf(path.ray)
-        sampled = paths.sample_bsdf(path.si, bsdf, numbers.lobe, numbers.direction, path.active)
-        bs, weight, delta = sampled
-        stops = path.active & ~delta & (dr.max(weight) > 0) & (sampler.next_1d() >= keep(bs.pdf))
-        found, sampler = paths.bounce(
-            scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled,
-            follow=lambda bs, delta: ~stops, direct=direct,
-        )  # fmt: skip
-        material = material_of(field, path.si, bsdf, stops)
-        here = End(path.si.p, vertex.facing(path.si), found.ray.d, path.β * weight, stops, material)
+        turn = walk.sample(path, bsdf, numbers.lobe, numbers.direction)
+        stops = path.active & ~turn.delta & (dr.max(turn.weight) > 0) & (sampler.next_1d() >= keep(turn.pdf))
+        thinned = {} if traces_all else {"follow": lambda bs, delta: ~stops, "direct": direct}
+        found, sampler = walk.bounce(integrator, scene, lights, path, sampler, numbers, bsdf, turn, **thinned)
+        material = material_at(field, walk, path, bsdf, stops)
+        here = End(*walk.place(path), found.ray.d, path.β * turn.weight, stops, material)
         end = dr.select(stops, here, end)
         direct_first = dr.select(is_first, path.β * found.direct, direct_first)
-        path, sampler = paths.roulette(paths.advance(path, found, integrator.depth_limit), sampler, integrator.rr_depth)
-        smooth = vertex.is_terminal(path.si, path.active)
-        spread = spread.arrive(path.si, path.ray, found.bs.pdf, found.delta, smooth)
+        before, path = path, walk.advance(integrator, path, found)
+        if traces_all:
+            path.active &= ~stops
+        path, sampler = paths.roulette(path, sampler, integrator.rr_depth + walk.later)
+        smooth = walk.terminal(path, path.active)
+        spread = walk.spread(spread, before, found, path, smooth)
         return path, end, spread, direct_first, mi.Bool(False), sampler
 
     n = dr.width(path.si.t)
-    a_0 = spread.camera_spread(dr.square(path.length), dr.dot(path.si.n, path.ray.d))
+    a_0 = walk.camera_spread(path)
     grown = PathSpread(dr.zeros(mi.Float, n), a_0, mi.Float(path.length), mi.Bool(path.active))
     material = {"material": (mi.Color3f(0), mi.Float(0))} if needs_material(field) else {}
     zeros = (dr.zeros(kind, n) for kind in (mi.Point3f, mi.Vector3f, mi.Vector3f, mi.Color3f, mi.Bool))

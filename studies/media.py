@@ -1,9 +1,10 @@
 """Denoised images of scenes with participating media, in equal time: ``python studies/media.py -o DIR``.
 
 A cloud under sky and sun, a courtyard full of fog in the sun, and wax inside of rough glass, by Mitsuba's `volpath` and
-by `neural_path`. Frames have 2 seconds of CPU time (1 s on two cores), a training step included, after 300 steps of
-training; shots have 20 seconds, 7 of them training. How many samples fit in is found by a render beforehand, kernels
-compiled. All runs on one thread and counts its CPU time, so that other programs disturb little.
+by integrators with a cache (`neural_path`; others by `--integrators`), with `denoised=true` where they have that.
+Frames have 2 seconds of CPU time (1 s on two cores), a training step included, after 300 steps of training; shots have
+20 seconds, 7 of them training. How many samples fit in is found by a render beforehand, kernels compiled. All runs on
+one thread and counts its CPU time, so that other programs disturb little.
 
 The error is the relative squared error ``(I - R)²/(R² + 0.01 mean(R)²)`` of the denoised image I. In the numerator the
 two factors have references with noise of their own, so that the noise of neither counts; in the denominator stands
@@ -207,7 +208,7 @@ def images_of(scene, name: str) -> list[tuple]:
         frame = max(1, round(n * FRAME / SHOT))
         found = [("shot", shot, *timed(lambda: [render(shot, 2)]))]
     else:
-        integrator = mi.load_dict({"type": name, "denoised": True})
+        integrator = mi.load_dict({"type": name} | ({} if name == "nrc" else {"denoised": True}))
         render = renderer(scene, integrator)
         integrator.train(scene, 8)
         shot = samples_in(render, SHOT - TRAINING, 32)
@@ -224,14 +225,14 @@ def images_of(scene, name: str) -> list[tuple]:
             for mode, spp, images, seconds in found]  # fmt: skip
 
 
-def measure(name: str, out: Path) -> list[dict]:
-    """The records of one scene, and PNG files: reference, `volpath`, `neural_path` (shots)."""
+def measure(name: str, out: Path, integrators: tuple[str, ...]) -> list[dict]:
+    """The records of one scene, and PNG files: reference, `volpath`, the other `integrators` (shots)."""
     import mitsuba as mi
 
     scene = mi.load_dict({"type": "scene", **CASES[name].make()})
     judge = Judge(scene, halves(scene, CASES[name], out / f"reference_{name}.npy"))
     records, pictures, before = [], [judge.shown], {}
-    for integrator in ("volpath", "neural_path"):
+    for integrator in ("volpath", *integrators):
         for mode, spp, seconds, images in images_of(scene, integrator):
             clean = [judge.clean(image) for image in images]
             error, deviation = np.mean([judge.error(image) for image in clean], axis=0)
@@ -252,6 +253,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scenes", nargs="*", default=list(CASES), help=", ".join(CASES))
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for media.json and pictures")
+    parser.add_argument("--integrators", nargs="+", default=["neural_path"], choices=["neural_path", "nrc", "nirc"],
+                        help="beside volpath (default: neural_path)")  # fmt: skip
     asked = parser.parse_args(arguments)
     if unknown := set(asked.scenes) - set(CASES):
         parser.error(f"unknown scenes: {', '.join(sorted(unknown))}; give some of: {', '.join(CASES)}")
@@ -261,7 +264,7 @@ def main(arguments: list[str] | None = None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(1)
     asked.output.mkdir(parents=True, exist_ok=True)
-    records = [record for name in asked.scenes for record in measure(name, asked.output)]
+    records = [record for name in asked.scenes for record in measure(name, asked.output, asked.integrators)]
     result = {"images": records, "environment": environment.describe()}
     exr.write_text(asked.output / "media.json", json.dumps(result, indent=1))
 

@@ -50,7 +50,7 @@ class Entrant:
 
 
 #: Integrators that render participating media.
-RENDER_MEDIA = ("plain_path", "nrc", "neural_path", "volpath")
+RENDER_MEDIA = ("plain_path", "nirc", "nrc", "neural_path", "volpath")
 #: Lights that the camera sees are noise of a known kind: left out by all, what they light is measured the better.
 PATH = {"hide_emitters": True}
 

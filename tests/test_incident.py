@@ -21,6 +21,7 @@ from mi_neural.caches.incident import IncidentCache, Training, reflect, trace_re
 from mi_neural.caches.records import TrainingRecords
 from mi_neural.caches.training_paths import Suffixes, trace_training_paths
 from mi_neural.caches.weights import FieldShape, Weights
+from mi_neural.render import path as paths
 from mi_neural.render import vertex
 from mi_neural.render.sampling import PathSampler
 
@@ -154,7 +155,7 @@ def test_reflected_cache_is_albedo_times_radiance(cube):
     field = constant_field(0.8)
     for n in (1, 3):
         sampler = PathSampler.make(dr.arange(mi.UInt32, 256), 1)
-        found, _ = reflect(field, field.encode(si.p), si, si.bsdf(), n, sampler, mi.Bool(True))
+        found, _ = reflect(field, field.encode(si.p), paths.start(ray, si, mi.Bool(True)), si.bsdf(), n, sampler)
         np.testing.assert_allclose(np.array(found), 0.4, rtol=1e-4)
 
 

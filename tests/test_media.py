@@ -223,7 +223,7 @@ def test_camera_that_walks_into_the_medium():
 # ---------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("name", ["nirc", "nirc_two_level", "nvc_direct", "restir_di"])
+@pytest.mark.parametrize("name", ["nirc_two_level", "nvc_direct", "restir_di"])
 @pytest.mark.parametrize("where", ["in the scene", "around the camera", "around a camera of its own"])
 def test_integrators_without_media_name_the_one_that_renders_them(name, where):
     scene, sensor = everywhere(fog()) if where == "around the camera" else room(box=cube(fog())), 0
@@ -232,11 +232,12 @@ def test_integrators_without_media_name_the_one_that_renders_them(name, where):
     with pytest.raises(ValueError, match=name + r': .*participating medium.*use <integrator type="plain_path"/>') as e:
         mi.load_dict({"type": name}).render(scene, sensor, spp=1)
     assert "\n" not in str(e.value)
+    assert all(kind in str(e.value) for kind in ('"neural_path"', '"nrc"', '"nirc"', '"volpath"'))
 
 
 def test_medium_of_an_instance_is_refused_by_integrators_without_media():
     with pytest.raises(ValueError, match=r'instance borders a participating medium.*use <integrator type="plain_path"'):
-        mi.load_dict({"type": "nirc"}).render(clouds(fog()), spp=1)
+        mi.load_dict({"type": "nirc_two_level"}).render(clouds(fog()), spp=1)
 
 
 def gradient(scene, key: str, how: str) -> None:
@@ -368,7 +369,10 @@ def direct_light_of_surfaces(scene, lights, path, bsdf, found, numbers, sampler,
     if lights is not None:
         sampled &= dr.max(f * light) > 0
         sampled &= ~scene.ray_test(si.spawn_ray_to(ds.p), sampled)
-    w_light = dr.select(mi.Bool(ds.delta), 1, mis_weight(pdf_light, pdf_bsdf))
+    in_full = mi.Bool(ds.delta)
+    if alone is not None:
+        in_full |= alone(pdf_bsdf)
+    w_light = dr.select(in_full, 1, mis_weight(pdf_light, pdf_bsdf))
     L_nee = vertex.finite(f * light * w_light, sampled)
     if lights is None:
         pdf_hit = scene.pdf_emitter_direction(ref, ds_hit, emits & ~delta)
@@ -393,10 +397,10 @@ def kernels(scene, keys: dict) -> set[str]:
     return codes
 
 
-@pytest.mark.parametrize("sampler", ["none", "power", "nvc", pytest.param("nrc", marks=SLOW), "neural_path"])
+@pytest.mark.parametrize("sampler", ["none", "power", "nvc", pytest.param("nrc", marks=SLOW), "neural_path", "nirc"])
 def test_scene_without_media_compiles_to_kernels_of_surfaces_alone(sampler, monkeypatch):
     scene, keys = room(), {"type": "plain_path", **DEPTH}
-    if sampler in ("nrc", "neural_path"):
+    if sampler in ("nrc", "neural_path", "nirc"):
         keys = {"type": sampler, "train_frames": 2, "train_samples": 256, **NETWORK, **DEPTH}
     elif sampler != "none":
         keys["light_sampler"] = SAMPLERS[sampler]

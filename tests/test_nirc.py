@@ -688,16 +688,6 @@ def test_scene_without_sensors_is_refused():
     refused(mi.load_dict({**FLOOR, **LIGHTS["constant"]}), "nirc: the scene has no sensor; add one")
 
 
-def test_scene_with_a_medium_is_refused_and_the_right_integrator_named():
-    fog = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}}
-    refused(mi.load_dict({**FLOOR, **CAMERA, **LIGHTS["constant"], "fog": fog}), "participating medium.*volpath")
-
-
-def test_camera_inside_a_medium_is_refused():
-    camera = {"camera": {**CAMERA["camera"], "medium": {"type": "homogeneous", "albedo": 0.5}}}
-    refused(mi.load_dict({**FLOOR, **camera, **LIGHTS["constant"]}), "medium.*volpath")
-
-
 @pytest.mark.parametrize("index", [1, 7, -1])
 def test_sensor_that_does_not_exist_is_refused(index):
     scene = mi.load_dict({**FLOOR, **CAMERA, **LIGHTS["constant"]})

@@ -117,7 +117,7 @@ class ControlCache(IncidentCache):
         self._measure = None
 
     def compare_frame(self, scene, sensor, lights, cache, seed):
-        records, _ = trace_records(scene, sensor, cache, self.training, seed, lights)
+        records, _ = trace_records(scene, sensor, cache, self.training, seed, lights, walk=self.walk)
         dr.eval(records)
         answers = cache.query(cache.encode(records.position, records.normal, **records.material()), records.direction)
         cache.observe(records, records.target, answers, answers)

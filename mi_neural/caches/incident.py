@@ -9,19 +9,18 @@ depends on nothing else; the authors' network also gets normal, albedo and rough
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..render import path as paths
-from ..render import vertex
 from ..render.sampling import PathSampler
+from ..render.walk import SURFACES, SurfaceWalk, in_medium
 from . import encoding, loss
 from .blend import Blend
 from .field import Field
-from .material import material_of, needs_material
+from .material import material_at, needs_material
 from .places import N_PLACES
 from .records import TrainingRecords
 from .reliability import Reliability
@@ -38,6 +37,9 @@ SCALE_TRIM = 1e-3
 NOTHING = 1e-20
 #: Share of the training paths that start where records lay, if that place has left the view.
 WORLD_SHARE = 0.25
+#: Share of the training paths that run on to their natural end in scenes with participating media, where
+#: `Training.n_vertices` are few.
+UNBOUNDED_IN_MEDIA = 1.0
 #: What training lessens; the second is the authors'.
 LOSSES = ("local", "weighted")
 
@@ -122,25 +124,28 @@ def _debiased(a: float, step):
 
 
 def trace_records(
-    scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None, places: tuple | None = None
-):
+    scene, sensor, field: Field | Blend | None, training: Training, seed, lights=None, places: tuple | None = None,
+    walk: SurfaceWalk = SURFACES,
+):  # fmt: skip
     """Fresh training records, and how many were left out because they were not finite.
 
-    Targets end in the cache as it is queried (in nothing without one); `lights` as in ``render.path.bounce``."""
+    Targets end in the cache as it is queried (in nothing without one), in participating media a share of them alone,
+    see `UNBOUNDED_IN_MEDIA`; `lights` as in ``render.path.bounce``. `walk`: how paths go from vertex to vertex."""
     lane = dr.arange(mi.UInt32, training.n_paths)
     sampler = PathSampler.make(lane, seed, index=lane, scramble=seed)
 
     def from_cache(path, active, sampler):
-        si, bsdf = path.si, path.si.bsdf(path.ray)
-        features = field.encode(si.p, vertex.facing(si), **material_of(field, si, bsdf, active))
-        return reflect(field, features, si, bsdf, training.n_tail, sampler, active)
+        bsdf, path = path.si.bsdf(path.ray), replace(path, active=active)
+        features = field.encode(*walk.place(path), **material_at(field, walk, path, bsdf, active))
+        return reflect(field, features, path, bsdf, training.n_tail, sampler, walk)
 
     plan = Suffixes(
         training.n_paths, training.n_vertices, surfaces=needs_material(field), world_share=WORLD_SHARE,
-        densities=training.loss == "weighted",
+        densities=training.loss == "weighted", arriving=True,
+        n_unbounded=round(UNBOUNDED_IN_MEDIA * training.n_paths) if walk.in_media else 0,
     )  # fmt: skip
     query = from_cache if field is not None else None
-    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights, places)
+    traced = trace_training_paths(scene, sensor, sampler, plan, query, lights, places, walk=walk)
     records = traced.incident
     if plan.surfaces:
         surface = traced.outgoing.surface
@@ -152,15 +157,17 @@ def trace_records(
     return records, traced.n_bad[1]
 
 
-def reflect(field: Field, features: list, si, bsdf, n: int, sampler, active):
-    """``1/n sum_i L(x, ω_i) f cos / p(ω_i)``: what a surface reflects of the cache, by `n` BSDF samples.
+def reflect(field: Field, features: list, path, bsdf, n: int, sampler, walk: SurfaceWalk = SURFACES):
+    """``1/n sum_i L(x, ω_i) f cos / p(ω_i)``: what a surface, or a point in a medium, where `path` is active sends on
+    of the cache, by `n` samples of its `bsdf` or phase function.
 
     Delta lobes are left out. Returns (that, sampler).
     """
+    active = path.active
 
     def add(i, total, sampler):
-        bs, weight, delta = paths.sample_bsdf(si, bsdf, sampler.next_1d(), sampler.next_2d(), active)
-        total += dr.select(active & ~delta, weight * field.query(features, si.to_world(bs.wo)), 0)
+        turn = walk.sample(path, bsdf, sampler.next_1d(), sampler.next_2d())
+        total += dr.select(active & ~turn.delta, turn.weight * field.query(features, turn.d), 0)
         return i + 1, total, sampler
 
     if n == 1:
@@ -253,6 +260,8 @@ class IncidentCache(Trainer):
     FIELD, SHAPE, BLEND = Field, FieldShape, Blend
     #: What the mean weight of the blend is called in the statistics.
     MEASURE = "reliability"
+    #: How training paths go from vertex to vertex; whoever changes it clears the recordings.
+    walk: SurfaceWalk = SURFACES
 
     def __init__(
         self, training: Training | None = None, shape: FieldShape | None = None, seed: int = 0, *, blend: str = "ema",
@@ -288,21 +297,33 @@ class IncidentCache(Trainer):
 
     def probe(self, scene, sensor, lights, seed):
         """Records without a cache, to measure the scene by. Is frozen."""
-        return trace_records(scene, sensor, None, self.training, seed, lights)
+        return trace_records(scene, sensor, None, self.training, seed, lights, walk=self.walk)
 
     def frame(self, scene, sensor, lights, cache, ages, seed, rate_factor):
         """Trace records and take a step on them: what :func:`~mi_neural.caches.trainer.found` gives. Is frozen."""
         with dr.suspend_grad():
             plain = getattr(cache, "field", cache)
             places = ages.left(1e-3 * dr.norm(1 / plain.box_inv_extent))
-            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights, places)
+            records, n_bad = trace_records(scene, sensor, cache, self.training, seed, lights, places, self.walk)
             dr.eval(records, n_bad)
             sampler = PathSampler.make(dr.arange(mi.UInt32, N_PLACES), seed + 0x7F4A7C15)
-            ages.places.remember(records.position, records.normal, records.valid, sampler)
+            self.remember(ages, records, sampler)
             learning_rate, decay = self.pace(ages, records.position, records.valid, rate_factor, plain)
         value, mean_target, mean_prediction = self.learn(cache, records, seed + 0x9E3779B9, learning_rate, decay)
         weight = cache.mean_sigma() if hasattr(cache, "mean_sigma") else 0
         return found(value, ages, mean_target, mean_prediction, dr.count(records.valid), n_bad, weight)
+
+    def remember(self, ages: Ages, records: TrainingRecords, sampler) -> None:
+        """Keep where the records of a step lie, and from where they are seen."""
+        view = records.normal
+        if records.inside is not None:
+            view = dr.select(in_medium(records.inside), -view, view)
+        ages.places.remember(records.position, view, records.valid, sampler, records.inside)
+
+    def forget_media(self) -> None:
+        """Forget what places of records are in, whose numbers are of other media."""
+        if self.field is not None:
+            self.ages.places.forget_media()
 
     def make_field(self, low: list, high: list, scale: float):
         """A new field for records between the corners `low` and `high`, in a scene of mean radiance `scale`."""

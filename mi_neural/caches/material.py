@@ -21,3 +21,14 @@ def material_of(field, si, bsdf, active) -> dict:
     with dr.suspend_grad():
         surface = surface_of(si, bsdf, active)
     return {"material": (dr.detach(surface.albedo), dr.detach(surface.roughness))}
+
+
+def material_at(field, walk, path, bsdf, active) -> dict:
+    """As :func:`material_of`, where a path stands that goes on by a `walk` (:mod:`mi_neural.render.walk`): at a surface
+    of that `bsdf`, or where a medium scatters."""
+    if not walk.in_media:
+        return material_of(field, path.si, bsdf, active)
+    if not needs_material(field):
+        return {}
+    surface = walk.surface(path, active, True)
+    return {"material": (surface.albedo, surface.roughness)}

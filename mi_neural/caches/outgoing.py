@@ -162,8 +162,6 @@ class OutgoingCache(IncidentCache):
     """A field of outgoing radiance together with its training. In all but what it learns an `IncidentCache`."""
 
     FIELD, BLEND = OutgoingField, OutgoingBlend
-    #: How training paths go from vertex to vertex; whoever changes it clears the recordings.
-    walk: SurfaceWalk = SURFACES
 
     def __init__(
         self, training: OutgoingTraining | None = None, shape: OutgoingShape | None = None, seed: int = 0, *,
@@ -207,6 +205,10 @@ class OutgoingCache(IncidentCache):
                 blend.refresh()
                 sigma = blend.mean_sigma()
         return found(value, ages, mean_target, mean_prediction, n_valid, n_bad + more, sigma)
+
+    def forget_media(self) -> None:
+        if self.field is not None:
+            self.field.places.forget_media()
 
     def note(self, field: OutgoingField, records, seed, decay) -> None:
         """Keep where the records of a step lie."""

@@ -24,6 +24,11 @@ class TrainingRecords:
 
     weight, pdf        ``f cos/p`` of the BSDF sample that `direction` is, and its density p (solid angle)
     albedo, roughness  of the surface, see :func:`~mi_neural.render.surface.surface_of`
+
+    In scenes with participating media, else None:
+
+    inside   what the record is in: see :meth:`~mi_neural.render.walk.SurfaceWalk.inside`; `position` may lie in a
+             medium, `normal` is the direction in which the path came to it then
     """
 
     position: mi.Point3f
@@ -35,6 +40,7 @@ class TrainingRecords:
     pdf: mi.Float | None = None
     albedo: mi.Color3f | None = None
     roughness: mi.Float | None = None
+    inside: mi.UInt32 | None = None
 
     def material(self) -> dict:
         """Keywords for the ``encode`` of a field that has the material as an input; none where it is not known."""

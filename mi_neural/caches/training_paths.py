@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -46,6 +47,7 @@ class Suffixes:
     twins           whether the paths 2k and 2k + 1 start with the same ray
     surfaces        whether records of outgoing radiance are wanted
     densities       whether the densities of BSDF rays are
+    arriving        whether incident records are wanted, in scenes with participating media
     """
 
     n_paths: int
@@ -59,6 +61,7 @@ class Suffixes:
     twins: bool = False
     surfaces: bool = True
     densities: bool = False
+    arriving: bool = False
 
 
 @dataclass
@@ -68,7 +71,8 @@ class PathRecords:
     outgoing   records of what the vertex sends out; only their positions and normals if no surfaces were asked for
     incident   records of the radiance that the BSDF ray brought back, emission excluded; valid for rays of smooth lobes
     direct     direct light that the vertex reflects towards its viewer, traced
-    weight     ``f cos/p`` of the BSDF ray that left it
+    weight     ``f cos/p`` of the BSDF ray that left it; in media, where incident records were not asked for, times what
+               the medium on the way left of the light
     stops      whether the vertex that the ray met is where a pixel's path would end in the cache
     pdf        density p of that BSDF ray (solid angle); of no meaning where densities were not asked for
     n_bad      how many outgoing and incident records were left out because their targets were not finite
@@ -159,6 +163,7 @@ class Vertices:
     emitted    emission met by the BSDF ray that left the vertex, weighed by MIS; Le
     estimated  next-event estimation at the vertex, weighed by MIS; L_nee
     weight     ``f cos/p`` of that BSDF ray, whose direction and lobe follow: whether the lobe is smooth
+    arriving   what media on its way left of the light, in one sample; None: it is in `weight`
     stops      see :class:`PathRecords`
     pdf        density of that BSDF ray, if asked for
     """
@@ -171,31 +176,40 @@ class Vertices:
     smooth: mi.Bool
     stops: mi.Bool
     pdf: mi.Float
+    arriving: mi.Color3f | None = None
 
     @classmethod
-    def empty(cls, size: int, densities: bool = False, in_media: bool = False) -> Vertices:
+    def empty(
+        cls, size: int, densities: bool = False, in_media: bool = False, arriving: bool = False
+    ) -> Vertices:  # fmt: skip
         colours = (dr.zeros(mi.Color3f, size) for _ in range(3))
         direction, smooth, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
         pdf = dr.zeros(mi.Float, size if densities else 1)
-        return cls(empty_surfaces(size, in_media), *colours, direction, smooth, stops, pdf)
+        flights = dr.zeros(mi.Color3f, size) if arriving else None
+        return cls(empty_surfaces(size, in_media), *colours, direction, smooth, stops, pdf, flights)
 
-    def keep(self, i, si, found: paths.Bounce, terminal, surface, inside=None) -> None:
-        """Write entries `i`; `surface` is None where only positions and normals of surfaces are wanted, `inside` where
-        there are no media."""
+    def keep(self, i, place: Callable, found: paths.Bounce, terminal, receives, surface, inside=None) -> None:
+        """Write entries `i`; `surface` is None where only positions and normals of surfaces are wanted, which `place()`
+        gives, `inside` where there are no media."""
         dr.scatter(self.emitted, found.Le, i)
         dr.scatter(self.estimated, found.L_nee, i)
-        dr.scatter(self.weight, found.weight, i)
+        if self.arriving is None:
+            dr.scatter(self.weight, found.weight, i)
+        else:
+            dr.scatter(self.weight, found.turn, i)
+            dr.scatter(self.arriving, found.end.weight, i)
         if surface is not None:
             for to, value in zip(self.records.surface.inputs(), surface.inputs(), strict=True):
                 dr.scatter(to, value, i)
         else:
-            dr.scatter(self.records.surface.position, si.p, i)
-            dr.scatter(self.records.surface.normal, vertex.facing(si), i)
+            position, normal = place()
+            dr.scatter(self.records.surface.position, position, i)
+            dr.scatter(self.records.surface.normal, normal, i)
         if inside is not None:
             dr.scatter(self.records.inside, inside, i)
         dr.scatter(self.records.valid, terminal, i)
         dr.scatter(self.direction, found.ray.d, i)
-        dr.scatter(self.smooth, terminal & found.traced & ~found.delta, i)
+        dr.scatter(self.smooth, receives & found.traced & ~found.delta, i)
 
 
 @dataclass
@@ -226,16 +240,18 @@ class _Tracer:
         plan, n_kept = self.plan, self.plan.n_vertices - 1
         lane = dr.arange(mi.UInt32, plan.n_paths)
         unbounded = lane < plan.n_unbounded
-        vertices = Vertices.empty(plan.n_paths * n_kept, plan.densities, self.walk_on.in_media)
+        in_media = self.walk_on.in_media
+        vertices = Vertices.empty(plan.n_paths * n_kept, plan.densities, in_media, in_media and plan.arriving)
 
         def step(k, path, spread, ends, n_rough, open_, sampler):
             i = k * plan.n_paths + lane
             terminal = self.walk_on.terminal(path, path.active)
             surface = self.surface(path, path.active) if plan.surfaces else None
             found, sampler = self.bounce(path, n_rough, sampler, surface.albedo if plan.surfaces else None)
-            vertices.keep(i, path.si, found, terminal, surface, self.walk_on.inside(path))
+            here, receives = partial(self.walk_on.place, path), self.walk_on.receives(path, path.active, terminal)
+            vertices.keep(i, here, found, terminal, receives, surface, self.walk_on.inside(path))
             if plan.densities:
-                dr.scatter(vertices.pdf, found.bs.pdf, i)
+                dr.scatter(vertices.pdf, found.pdf, i)
             before, path = path, self.walk_on.advance(UNLIMITED, path, found)
             open_ = mi.Bool(path.active)
             if plan.surfaces:
@@ -298,9 +314,15 @@ def _back_to_front(plan: Suffixes, vertices: Vertices, n_vertices, end) -> mi.Co
     for k in reversed(range(plan.n_vertices - 1)):
         i = k * plan.n_paths + lane
         S = dr.select(n_vertices == k + 1, end, S)
-        dr.scatter(arrived, S, i)
         weight = dr.gather(mi.Color3f, vertices.weight, i)
-        reflected = weight * S
+        if vertices.arriving is None:
+            dr.scatter(arrived, S, i)
+            reflected = weight * S
+        else:
+            left = dr.gather(mi.Color3f, vertices.arriving, i)
+            weight *= left
+            dr.scatter(arrived, left * S, i)
+            reflected = weight * S
         direct = dr.gather(mi.Color3f, vertices.estimated, i) + weight * dr.gather(mi.Color3f, vertices.emitted, i)
         S = direct + reflected
         if plan.surfaces:
@@ -320,7 +342,8 @@ def trace_training_paths(
 
     N being next-event estimation, E the emission met by the BSDF ray (the two share the direct light by MIS) and f the
     BSDF sample's weight. It is the target of outgoing records for the content ``reflected``; for ``indirect`` that is
-    ``f_k S_{k+1}``. The target of an incident record at vertex k is S_{k+1}. At the end of a path ``query(path,
+    ``f_k S_{k+1}``. The target of an incident record at vertex k is S_{k+1}, in participating media times what the
+    medium on the way left of it. At the end of a path ``query(path,
     active, sampler)``, which returns (value, sampler), stands for what the cache holds of S (self-training; None:
     nothing). Paths that left the scene, or that run on without an end, are not self-trained. `walk`: how paths go from
     vertex to vertex.
@@ -341,7 +364,10 @@ def trace_training_paths(
     records.valid &= finite
     records.target = dr.select(records.valid, records.target, 0)
     surface = records.surface
-    incident = TrainingRecords(surface.position, vertices.direction, surface.normal, arrived, vertices.smooth)
+    incident = TrainingRecords(
+        surface.position, vertices.direction, surface.normal, arrived, vertices.smooth, inside=records.inside
+    )
     n_bad = n_bad, leave_out_nonfinite(incident)
-    direct = vertices.estimated + vertices.weight * vertices.emitted
+    emitted = vertices.emitted if vertices.arriving is None else vertices.arriving * vertices.emitted
+    direct = vertices.estimated + vertices.weight * emitted
     return PathRecords(records, incident, direct, vertices.weight, vertices.stops, vertices.pdf, n_bad)

@@ -159,7 +159,7 @@ class Ages:
         near = dr.gather(mi.Float, self.recent, self.voxels.entry(p, self.N_ENTRIES)) > self.RARE * self.usual
         p = dr.select(near, math.nan, p)
         dr.eval(p)
-        return p, self.places.view, distance
+        return p, self.places.view, distance, self.places.inside
 
     #: What training changes.
     LEARNED = ("steps", "first", "recent", "usual", "total", "novelty", "places.position", "places.view", "places.age")

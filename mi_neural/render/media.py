@@ -17,6 +17,7 @@ homogeneous media, and estimated by ratio tracking in others (Novák et al. 2014
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
@@ -25,7 +26,16 @@ import mitsuba as mi
 from .. import parameters
 from . import path as paths
 from . import vertex
-from .medium_path import Flight, MediumBounce, MediumPath, Scattering, beyond, interaction, scattering_point
+from .medium_path import (
+    Flight,
+    MediumBounce,
+    MediumPath,
+    Scattering,
+    beyond,
+    interaction,
+    phase_function,
+    scattering_point,
+)
 from .tracking import colour, event, exists, flown, is_boundary, medium_interaction
 
 #: Dimension of the stratified number by which the distance along a camera ray is sampled.
@@ -148,29 +158,39 @@ class Media:
         )  # fmt: skip
         return self._arrive(path, limit), sampler
 
-    def bounce(self, integrator, scene, lights, path: MediumPath, sampler, numbers=None) -> tuple:
+    def sample(self, path: MediumPath, lobe, direction) -> paths.Turn:
+        """A direction by BSDF or phase function where `path` stands, from uniform numbers."""
+        si, in_medium = path.si, path.active & path.scattered
+        at_surface = path.active & ~path.scattered
+        bs, weight, delta = paths.sample_bsdf(si, si.bsdf(path.ray), lobe, direction, at_surface)
+        wo, weight_medium, pdf_medium = phase_function(path, in_medium).sample(
+            mi.PhaseFunctionContext(None), scattering_point(path), lobe, direction, in_medium
+        )
+        weight = dr.select(in_medium, vertex.finite(weight_medium, pdf_medium > 0), weight)
+        pdf, d = dr.select(in_medium, pdf_medium, bs.pdf), dr.select(in_medium, wo, si.to_world(bs.wo))
+        return paths.Turn((bs,), weight, delta & ~in_medium, pdf, d)
+
+    def bounce(
+        self, integrator, scene, lights, path: MediumPath, sampler, numbers=None, *, turn: paths.Turn | None = None,
+        follow: Callable | None = None, alone: Callable | None = None, direct: Callable | None = None,
+    ):  # fmt: skip
         """Sample a direction where `path` stands, by BSDF or phase function, follow it to the next vertex, and find
-        direct light. Returns (:class:`MediumBounce`, sampler). `numbers`: in place of the sampler's own."""
+        direct light. Returns (:class:`MediumBounce`, sampler). `numbers`: in place of the sampler's own; `turn`: what
+        :meth:`sample` gave before, in place of a new sample; else see :func:`.path.bounce`, where `follow` gets `turn`
+        in place of a BSDF sample, and `direct` gets a :class:`Place` as its last argument."""
         if numbers is None:
             numbers, sampler = paths.draw_numbers(sampler)
         si, active, in_medium = path.si, path.active, path.active & path.scattered
-        at_surface = active & ~path.scattered
-        bsdf = si.bsdf(path.ray)
-        bs, weight, delta = paths.sample_bsdf(si, bsdf, numbers.lobe, numbers.direction, at_surface)
-        phase = dr.select(in_medium, path.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
-        wo, weight_medium, pdf_medium = phase.sample(
-            mi.PhaseFunctionContext(None), scattering_point(path), numbers.lobe, numbers.direction, in_medium
-        )
-        weight = dr.select(in_medium, vertex.finite(weight_medium, pdf_medium > 0), weight)
-        d = dr.select(in_medium, wo, si.to_world(bs.wo))
+        at_surface, bsdf, phase = active & ~path.scattered, si.bsdf(path.ray), phase_function(path, in_medium)
+        turn = self.sample(path, numbers.lobe, numbers.direction) if turn is None else turn
+        (bs,), weight, delta, d = turn.sampled, turn.weight, turn.delta, turn.d
 
-        delta &= ~in_medium
         it, receiver = interaction(path), vertex.receiver(si, bsdf)
-        here = last = Scattering(
-            it.p, it.n, *receiver, in_medium, dr.select(in_medium, pdf_medium, bs.pdf), delta
-        )
+        here = last = Scattering(it.p, it.n, *receiver, in_medium, turn.pdf, delta)
         null, deeper, hidden = mi.Bool(False), active, None
         followed = active & (dr.max(weight) > 0)
+        if follow is not None:
+            followed &= follow(turn, delta)
         if self.partial:
             null = at_surface & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
             last = dr.select(null, path.last, here)
@@ -183,11 +203,11 @@ class Media:
         emits = followed & ~end.scattered
         found = MediumBounce(
             bs, weight * end.weight, delta, end.ray, end.si, emits if hidden is None else emits & ~hidden,
-            mi.Spectrum(0), mi.Spectrum(0), end, null, followed, last,
+            mi.Spectrum(0), mi.Spectrum(0), end, null, followed, last, weight,
         )  # fmt: skip
         place = Place(self, path, it, bsdf, phase, receiver, last)
-        found.L_nee, found.Le, sampler = paths.direct_light(
-            scene, lights, replace(path, active=deeper), bsdf, found, numbers, sampler, here=place
+        found.L_nee, found.Le, sampler = (direct or paths.direct_light)(
+            scene, lights, replace(path, active=deeper), bsdf, found, numbers, sampler, alone, place
         )
         return found, sampler
 
@@ -197,8 +217,8 @@ class Media:
         path = MediumPath(
             path.L + path.β * found.direct, path.β * found.weight,
             path.η * dr.select(path.scattered, 1, found.bs.eta), path.depth + dr.select(found.null, mi.UInt32(0), 1),
-            path.length, end.ray, end.si, path.valid | (path.active & ~found.null), found.goes_on, end.p, end.scattered,
-            end.medium, path.channel, end.shares, found.last if self.partial else None,
+            path.length, end.ray, end.si, path.valid | (path.active & ~found.null), mi.Bool(found.goes_on), end.p,
+            end.scattered, end.medium, path.channel, end.shares, found.last if self.partial else None,
         )  # fmt: skip
         return self._arrive(path, paths.depth_limit(integrator.max_depth))
 

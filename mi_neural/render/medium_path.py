@@ -86,21 +86,36 @@ class MediumBounce(paths.Bounce):
     null     whether the surface was passed as if it were not there
     goes_on  whether the ray was followed
     last     where the path last changed its direction
+    turned   `weight` without that of the flight
     """
 
     end: Flight
     null: mi.Bool
     goes_on: mi.Bool
     last: Scattering
+    turned: mi.Spectrum
 
     @property
     def traced(self):
         return self.goes_on
 
+    @property
+    def turn(self):
+        return self.turned
+
+    @property
+    def pdf(self):
+        return self.last.pdf
+
 
 def scattering_point(path: MediumPath):
     """Where a path is scattered by a medium."""
     return medium_interaction(path.p, path.ray, path.medium)
+
+
+def phase_function(path: MediumPath, in_medium):
+    """The phase function where a path is scattered."""
+    return dr.select(in_medium, path.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
 
 
 def interaction(path: MediumPath):

@@ -99,6 +99,34 @@ class Bounce:
         """Whether the ray was traced."""
         return self.followed
 
+    @property
+    def turn(self):
+        """`weight` without what media on the way do to the light."""
+        return self.weight
+
+    @property
+    def pdf(self):
+        """Density of the ray's direction (solid angle)."""
+        return self.bs.pdf
+
+
+@dataclass
+class Turn:
+    """A direction in which a path may go on.
+
+    sampled  what was sampled, for a bounce in this direction
+    weight   ``f cos / p``, in a medium that of the phase function
+    delta    whether a mirror lobe was sampled
+    pdf      density of the direction (solid angle)
+    d        the direction, world space
+    """
+
+    sampled: tuple
+    weight: mi.Spectrum
+    delta: mi.Bool
+    pdf: mi.Float
+    d: mi.Vector3f
+
 
 def depth_limit(max_depth: int) -> int:
     """Mitsuba's ``max_depth``, -1 being no limit, as a number to compare depths with."""
@@ -355,7 +383,7 @@ def _light_met(scene, lights, here, found: Bounce, hit: _Hit, pmf_hit, n_lights,
         return dr.select(hit.emits, found.si.emitter(scene, hit.emits).eval(found.si, hit.emits) * w_bsdf, 0)
 
 
-def emission_alone(scene, lights, path, bsdf, found: Bounce, numbers, sampler, alone=None):
+def emission_alone(scene, lights, path, bsdf, found: Bounce, numbers, sampler, alone=None, here=None):
     """As :func:`direct_light` for mirrors, which no light sample can reach: the emission that the ray met."""
     return mi.Spectrum(0), vertex.emission(scene, found.si, found.followed), sampler
 

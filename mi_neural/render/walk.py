@@ -8,12 +8,13 @@ there. So the reflectance that is factored out of the cache is 1 there.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, is_dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from ..estimators.spread import PathSpread
+from ..estimators.spread import PathSpread, camera_spread, segment_spread
 from . import path as paths
 from . import vertex
 from .media import Media
@@ -38,17 +39,45 @@ class SurfaceWalk:
         """(a path at what a camera ray meets, sampler)."""
         return paths.camera_vertex(integrator, scene, ray, active), sampler
 
-    def bounce(self, integrator, scene, lights, path, sampler, numbers=None, bsdf=None) -> tuple:
-        """(what a bounce found, sampler)."""
-        return paths.bounce(scene, lights, path, sampler, numbers, bsdf=bsdf)
+    def first_vertex(self, integrator, scene, ray, sampler, active) -> tuple:
+        """(a path at the first vertex behind mirrors and glass, with the emission that is seen on the way, sampler).
+        Its `length` is the distance along them."""
+        path = paths.camera_vertex(integrator, scene, ray, active)
+        limit = paths.depth_limit(integrator.max_depth)
+        return paths.follow_mirrors(scene, path, sampler, limit, integrator.rr_depth)
+
+    def sample(self, path, bsdf, lobe, direction) -> paths.Turn:
+        """A direction where a path stands at a surface of that `bsdf`, from uniform numbers."""
+        bs, weight, delta = paths.sample_bsdf(path.si, bsdf, lobe, direction, path.active)
+        return paths.Turn((bs, weight, delta), weight, delta, bs.pdf, path.si.to_world(bs.wo))
+
+    def bounce(
+        self, integrator, scene, lights, path, sampler, numbers=None, bsdf=None, turn: paths.Turn | None = None, **how
+    ) -> tuple:
+        """(what a bounce found, sampler). `turn`: what :meth:`sample` gave before; `how`: see :func:`.path.bounce`."""
+        sampled = None if turn is None else turn.sampled
+        return paths.bounce(scene, lights, path, sampler, numbers, bsdf=bsdf, sampled=sampled, **how)
 
     def advance(self, integrator, path, found):
         """The path at the next vertex."""
         return paths.advance(path, found, paths.depth_limit(integrator.max_depth))
 
+    def camera_spread(self, path):
+        """Footprint a_0 of a pixel where the path stands, that came from :meth:`first_vertex`."""
+        return camera_spread(dr.square(path.length), dr.dot(path.si.n, path.ray.d))
+
+    def segment_spread(self, path, found):
+        """What the ray of a bounce adds to the square root of the spread of `path`, from which it starts."""
+        cos_theta = dr.dot(found.si.n, found.ray.d)
+        return dr.select(found.delta, 0, segment_spread(found.si.t**2, found.pdf, cos_theta))
+
     def terminal(self, path, active):
         """Whether a path may end in a cache where it stands."""
         return vertex.is_terminal(path.si, active)
+
+    def receives(self, path, active, terminal):
+        """Whether a cache of incident light learns what arrives where a path stands, which is `terminal` or not."""
+        return terminal
 
     def place(self, path) -> tuple:
         """Where a path stands: (position, normal on the side that it came from)."""
@@ -74,7 +103,8 @@ class SurfaceWalk:
 
 
 class MediaWalk(SurfaceWalk):
-    """Steps of paths through `media`; `camera` is the medium that the camera is in (None: none).
+    """Steps of paths through `media`; `camera` is the medium that the camera is in (None: none). `windows`: whether
+    paths may end at rough glass around a medium.
 
     Roulette begins one bounce later than on surfaces, as in ``volpath``. Training paths survive it with their
     throughput as probability: at most 0.95 would make the light of long paths in a medium of high albedo rare and huge,
@@ -85,22 +115,64 @@ class MediaWalk(SurfaceWalk):
     in_media = True
     most_survival, most_vertices, gives_up = 1.0, 128, False
 
-    def __init__(self, media: Media, camera: mi.Medium | None = None):
-        self.media, self.camera, self.may_stay = media, camera, media.partial
+    def __init__(self, media: Media, camera: mi.Medium | None = None, windows: bool = False):
+        self.media, self.camera, self.may_stay, self.windows = media, camera, media.partial, windows
 
     def camera_vertex(self, integrator, scene, ray, sampler, active):
         return self.media.camera_vertex(integrator, scene, ray, self.camera, sampler, active)
 
-    def bounce(self, integrator, scene, lights, path, sampler, numbers=None, bsdf=None):
-        return self.media.bounce(integrator, scene, lights, path, sampler, numbers)
+    def first_vertex(self, integrator, scene, ray, sampler, active):
+        path, sampler = self.camera_vertex(integrator, scene, ray, sampler, active)
+        path.length = dr.select(path.active, dr.norm(self.place(path)[0] - ray.o), 0)
+
+        def is_mirror(path):
+            return ~path.scattered & vertex.is_mirror(path.si, path.active)
+
+        def step(path, mirror, sampler):
+            before = self.place(path)[0]
+            found, sampler = self.bounce(integrator, scene, None, path, sampler, direct=paths.emission_alone)
+            path = self.advance(integrator, path, found)
+            path.length += dr.select(path.active, dr.norm(self.place(path)[0] - before), 0)
+            path, sampler = paths.roulette(path, sampler, integrator.rr_depth + self.later)
+            return path, is_mirror(path), sampler
+
+        path, _, sampler = dr.while_loop(
+            (path, is_mirror(path), sampler), lambda path, mirror, sampler: mirror, step, label="mirrors"
+        )
+        return path, sampler
+
+    def sample(self, path, bsdf, lobe, direction):
+        return self.media.sample(path, lobe, direction)
+
+    def bounce(self, integrator, scene, lights, path, sampler, numbers=None, bsdf=None, turn=None, **how):
+        return self.media.bounce(integrator, scene, lights, path, sampler, numbers, turn=turn, **how)
 
     def advance(self, integrator, path, found):
         return self.media.advance(integrator, path, found)
 
+    def camera_spread(self, path):
+        cosine = dr.select(path.scattered, 1, dr.dot(path.si.n, path.ray.d))
+        return camera_spread(dr.square(path.length), cosine)
+
+    def segment_spread(self, path, found):
+        end = found.end
+        arrives, p = end.scattered | end.si.is_valid(), dr.select(end.scattered, end.p, end.si.p)
+        cosine = dr.select(end.scattered, 1, dr.dot(end.si.n, end.ray.d))
+        grown = segment_spread(dr.squared_norm(p - self.place(path)[0]), found.pdf, cosine)
+        return dr.select(found.delta, 0, dr.select(arrives, grown, math.inf))
+
     def terminal(self, path, active):
-        """No rough glass around a medium: from inside its radiance has the sharp lobes of what is outside."""
-        window = path.si.is_medium_transition() & vertex.transmits(path.si.bsdf())
-        return active & (path.scattered | (vertex.is_terminal(path.si, active) & ~window))
+        """No rough glass around a medium, but for caches of incident light (`windows`): from inside its radiance has
+        the sharp lobes of what is outside."""
+        smooth = vertex.is_terminal(path.si, active)
+        if not self.windows:
+            smooth &= ~(path.si.is_medium_transition() & vertex.transmits(path.si.bsdf()))
+        return active & (path.scattered | smooth)
+
+    def receives(self, path, active, terminal):
+        """Also at surfaces that let a part of the light pass: what arrives there is learned as elsewhere. Without that
+        the image of a half open shell full of fog is 3 % too bright where the cache answers at its first vertex."""
+        return active & (path.scattered | vertex.is_smooth(path.si, active)) if self.windows else terminal
 
     def place(self, path):
         normal = dr.select(path.scattered, path.ray.d, vertex.facing(path.si))
@@ -163,6 +235,11 @@ def _where(mask, new: dict, path):
             value = _where(mask, {f.name: getattr(value, f.name) for f in fields(old)}, old)
         changed[name] = None if old is None else value if is_dataclass(old) else dr.select(mask, value, old)
     return replace(path, **changed)
+
+
+def in_medium(inside):
+    """Whether what :meth:`MediaWalk.inside` says is a point in a medium."""
+    return (inside > 0) & (inside % 2 == 0)
 
 
 #: For scenes without media.
