@@ -208,7 +208,7 @@ SHARED_KEYS = (
        - Largest number of entries of a level. (Default: 32768)
      * - width
        - |int|
-       - Width of the network's hidden layers. (Default: 32)
+       - Width of the network's hidden layers. (Default: 16; of ``nrc`` and ``neural_path`` 32)
      * - hidden_layers
        - |int|
        - Number of hidden layers. (Default: 2)

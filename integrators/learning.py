@@ -42,7 +42,7 @@ class LearningIntegrator(FilmIntegrator):
                      "width": props.get("width", None), "hidden_layers": props.get("hidden_layers", None)}  # fmt: skip
             self.given = {k: v for k, v in sizes.items() if v is not None}
             sizes = {planning.SIZES[k]: v for k, v in self.given.items()}
-            shape = FieldShape(**sizes, **self.shape_keys(props))
+            shape = FieldShape(**{**self.shape_keys(props), **sizes})
         except ValueError as e:
             message = str(e).removeprefix(f"{self.plugin}: ")
             raise ValueError(f"{self.plugin}: {_in_keys(message)}") from None

@@ -10,6 +10,7 @@ import mitsuba as mi
 from mi_neural import plan
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining
+from mi_neural.caches.outgoing_field import OutgoingShape
 from mi_neural.integrators import gradients
 from mi_neural.integrators.common import CacheIntegrator
 
@@ -97,6 +98,9 @@ class OutgoingIntegrator(CacheIntegrator):
     def check_media(self) -> None:
         self._check(self.media is None or self.cache.training.roughening == 0,
                     "roughening works in scenes without participating media; leave it out")  # fmt: skip
+
+    def shape_keys(self, props) -> dict:
+        return {"width": OutgoingShape.width}
 
     def default_paths(self) -> int:
         return OutgoingTraining.usual_paths()

@@ -196,7 +196,7 @@ def main(arguments: list[str] | None = None) -> int:
     from ablation import reference_of
 
     mi.set_variant("llvm_ad_rgb")
-    dr.set_thread_count(1)
+    threads = dr.thread_count()
     options.output.mkdir(parents=True, exist_ok=True)
     seconds, records = sorted(float(s) for s in options.seconds.split(",")), []
     try:
@@ -205,9 +205,11 @@ def main(arguments: list[str] | None = None) -> int:
         if unknown := set(options.only or ()) - set(chosen):
             raise load.InputError(f"there is no variant {', '.join(unknown)}; there are {', '.join(variants())}")
         for name in options.scenes:
+            dr.set_thread_count(threads)  # with one, Mitsuba 3.9.1 waits forever for an EXR file
             loaded = load.load_scene(name, terminal.parse_sizes(options.size), {"max_depth": "64"})
             reference = reference_of(loaded, options.output, options.reference_spp, None, same_depth=True)
             exposures = metrics.flip_exposures(reference.rgb)
+            dr.set_thread_count(1)
 
             def judge(image, reference=reference, exposures=exposures):
                 image = metrics.block_means(image, reference.rgb.shape)

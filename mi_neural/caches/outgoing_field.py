@@ -48,6 +48,7 @@ class OutgoingShape(FieldShape):
     `inputs`: what the network is told of a surface beside its position, any of `INPUTS`.
     """
 
+    width: int = 32
     normal_degree: int = 3
     inputs: tuple[str, ...] = INPUTS
 

@@ -39,7 +39,7 @@ class FieldShape:
     base_resolution: int = 8
     per_level_scale: float = 1.6
     direction_degree: int = 3
-    width: int = 32
+    width: int = 16
     n_hidden: int = 2
     n_outputs: int = 3
     leak: float = 0.0
