@@ -82,7 +82,8 @@ def test_extraction_of_every_table_fits_its_rows_and_columns(results):
         assert len(table["extract"]["rows"]) == len(table["rows"])
         assert len(table["extract"]["columns"]) == len(table["columns"])
         keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "asked", "width",
-                "spp", "frames", "why", "setting", "method", "kernels", "values", "as", "title", "each")  # fmt: skip
+                "spp", "frames", "seconds", "why", "setting", "method", "kernels", "values", "as", "title",
+                "each")  # fmt: skip
         for part in (*table["extract"]["rows"], *table["extract"]["columns"]):
             assert not set(part or {}) - set(keys)
 
