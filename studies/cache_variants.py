@@ -87,6 +87,8 @@ def muon(factor: float) -> dict:
     import drjit as dr
     from drjit.opt import Adam, _newton_schulz
 
+    from mi_neural.caches.optimizer import attach_adam
+
     class AdamMuon(Adam):
         def _step(self, cache, value, grad, lr, extra):
             shape = self.shapes.get(dr.width(value))
@@ -100,15 +102,8 @@ def muon(factor: float) -> dict:
             return dr.fma(straight, scale, value), (t + 1, momentum, second, largest)
 
     def attach(parameters: dict):
-        from mi_neural.caches.optimizer import own_copy
-
-        optimizer = AdamMuon(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
+        optimizer = attach_adam(parameters, AdamMuon)
         optimizer.shapes = {int(np.prod(v.shape)): v.shape for k, v in parameters.items() if len(v.shape) == 2}
-        optimizer.update(parameters)
-        for key, (value, promoted, lr, (t, *moments)) in optimizer.state.items():
-            value = own_copy(value)
-            dr.enable_grad(value)
-            optimizer.state[key] = value, promoted, lr, (dr.opaque(type(t), 0), *moments)
         return optimizer
 
     return {"mi_neural.caches.field.attach_adam": attach}

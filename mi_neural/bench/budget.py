@@ -321,7 +321,7 @@ def render_until(
     does not train.
     """
     start, film, estimate, needed = clock(), Groups(), None, 4.0
-    expected_bias, bias = getattr(integrator, "expected_bias", lambda _: 0.0), 0.0  # the latter: mean of the passes
+    expected_bias, bias = getattr(integrator, "expected_bias", lambda _: 0.0), 0.0  # the latter: mean of the samples
     run = _Run(scene, integrator, seed, sensor, keep, 0, film)
     sizes = pass_sizes(scene, sensor)
     try:
@@ -329,26 +329,23 @@ def render_until(
             traced = statistics(integrator).get("noise_of_pairs", 0.0) / error
             planned = max(round(needed), round(traced), film.spp + 1)
             run.plan(planned)
-            before, look = film.spp, film.spp + max(1, min(film.spp, round(0.9 * (needed - film.spp))))
-            while film.spp < look:
-                if film.spp and seconds is not None and clock() - start >= seconds:
-                    found = film.error()
-                    return run.result(), found and found.with_bias(max(bias, expected_bias(planned) ** 0.5) ** 2)
-                run.one_pass(max(s for s in sizes if s == 1 or s <= look - film.spp))
-            estimate = film.error()
-            bias += (expected_bias(planned) ** 0.5 - bias) * (film.spp - before) / film.spp
-            if estimate:
-                needed = film.spp * estimate.value / (error - min(bias**2, 0.5 * error))
-                estimate = estimate.with_bias(bias**2)
+            of_pass = expected_bias(planned) ** 0.5
+            look, late = film.spp + max(1, min(film.spp, round(0.9 * (needed - film.spp)))), False
+            while film.spp < look and not late:
+                n = max(s for s in sizes if s == 1 or s <= look - film.spp)
+                run.one_pass(n)
+                bias += (of_pass - bias) * n / film.spp
+                late = seconds is not None and clock() - start >= seconds
+            if (noise := film.error()) is not None:
+                needed = film.spp * noise.value / (error - min(bias**2, 0.5 * error))
+                estimate = noise.with_bias(bias**2)
                 if progress:
                     progress(min(film.spp, needed), needed)
-                if trained is not None and estimate.value > error and hasattr(integrator, "train_fraction"):
-                    whole = run.seconds_render * min(needed / film.spp, 4.0)
-                    share = integrator.train_fraction(whole)
-                    missing = whole * share / (1 - share) - trained - run.seconds_train
-                    left = math.inf if seconds is None else seconds - (clock() - start)
-                    if missing > 0.1 * whole and left > 0:
-                        run.train_seconds(min(missing, left))
+            if late:
+                break
+            if estimate is not None and estimate.value > error and trained is not None:
+                whole = run.seconds_render * min(needed / film.spp, 4.0)
+                run.train_on(whole, trained, math.inf if seconds is None else seconds - (clock() - start))
     except KeyboardInterrupt:
         run.interrupted = True
     finally:
@@ -400,6 +397,16 @@ class _Run:
             self.integrator.train_seconds(self.scene, seconds, sensor=self.sensor)
         finally:
             self.seconds_train += clock() - start
+
+    def train_on(self, rendering: float, trained: float, left: float) -> None:
+        """Train until training has had its share (`train_fraction`) beside so many seconds of `rendering`, those
+        included that it has had before the run (`trained`). It takes the seconds that are `left` at most, and a small
+        rest is not worth a call."""
+        if hasattr(self.integrator, "train_fraction"):
+            share = self.integrator.train_fraction(rendering)
+            missing = rendering * share / (1 - share) - trained - self.seconds_train
+            if missing > 0.1 * rendering and left > 0:
+                self.train_seconds(min(missing, left))
 
     def one_pass(self, spp: int) -> float:
         """Render and accumulate one pass; returns its seconds without such training as happened inside."""

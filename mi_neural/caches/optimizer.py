@@ -49,9 +49,10 @@ def own_copy(value):
     return copy
 
 
-def attach_adam(parameters: dict) -> Adam:
-    """An optimiser of copies of `parameters`, by name, that a frozen step can take; β_2 is 0.99."""
-    optimizer = Adam(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
+def attach_adam(parameters: dict, kind: type[Adam] = Adam) -> Adam:
+    """An optimiser of copies of `parameters`, by name, that a frozen step can take; β_2 is 0.99. `kind`: Adam, or a
+    class derived from it."""
+    optimizer = kind(lr=0.0, beta_1=0.9, beta_2=0.99, epsilon=1e-15)
     optimizer.update(parameters)
     # A frozen step is recorded anew when inputs that shared a variable cease to: from the start, share none
     for key, (value, promoted, lr, (t, *moments)) in optimizer.state.items():

@@ -179,9 +179,7 @@ class Vertices:
     arriving: mi.Color3f | None = None
 
     @classmethod
-    def empty(
-        cls, size: int, densities: bool = False, in_media: bool = False, arriving: bool = False
-    ) -> Vertices:  # fmt: skip
+    def empty(cls, size: int, densities: bool = False, in_media: bool = False, arriving: bool = False) -> Vertices:
         colours = (dr.zeros(mi.Color3f, size) for _ in range(3))
         direction, smooth, stops = dr.zeros(mi.Vector3f, size), dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
         pdf = dr.zeros(mi.Float, size if densities else 1)
