@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from contextlib import contextmanager
@@ -13,8 +12,7 @@ import numpy as np
 
 from mi_neural import plan
 from mi_neural.caches.field import CacheFileError
-from mi_neural.caches.files import damaged
-from mi_neural.integrators import gradients, planning
+from mi_neural.integrators import cache_files, gradients, planning
 from mi_neural.integrators.base import Nonfinite
 from mi_neural.integrators.checks import FILM_VALUES, check_scene
 from mi_neural.integrators.learning import LearningIntegrator
@@ -27,24 +25,6 @@ from mi_neural.render.walk import SURFACES, MediaWalk
 
 #: Frames that `train_frames = -1` trains at least and at most.
 SETTLE_FRAMES = (128, 400)
-
-
-def scene_signature(scene) -> str:
-    """A short hash of what makes a scene another scene: its shapes, their primitives, its emitters and extent."""
-    box = scene.bbox()
-    facts = (
-        sorted(int(s.primitive_count()) for s in scene.shapes()),
-        len(scene.emitters()),
-        [float(f"{float(v):.4g}") for v in (*box.min, *box.max)],
-    )
-    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
-
-
-def _other_scene(path) -> str:
-    return (
-        f"the cache in '{path}' was trained in another scene, or the geometry has changed since; "
-        "train one for this scene, or type reset()"
-    )
 
 
 class _State:
@@ -222,9 +202,9 @@ class CacheIntegrator(LearningIntegrator):
         check_scene(scene, self.plugin, self.renders_media)
         if self.state.signature is not None:
             self.reset()
-        signature = scene_signature(scene)
+        signature = cache_files.scene_signature(scene)
         if self.state.loaded is not None and self.state.loaded[1] != signature:
-            raise CacheFileError(_other_scene(*self.state.loaded[:1]))
+            raise CacheFileError(cache_files.other_scene(*self.state.loaded[:1]))
         self.state.signature = signature
         if is_another:
             self.forget_scene()
@@ -406,38 +386,7 @@ class CacheIntegrator(LearningIntegrator):
     def check_file(self, path, header: dict) -> None:
         """Raise `CacheFileError` for a cache, of the right sizes, that means something else here."""
 
-    def save_cache(self, path) -> None:
-        """Write the trained cache to `path`, whole or not at all."""
-        if self.cache.field is None:
-            raise RuntimeError(f"{self.plugin}: there is no cache to save yet; render an image or call train() first")
-        self.cache.save(
-            path, scene=self.state.signature, statistics=dict(self.cache.statistics), **self.file_facts()
-        )
-
-    def load_cache(self, path, scene=None) -> None:
-        """Go on from a cache file. With `scene`, or once a scene was rendered: refuse a cache of another scene.
-
-        Raises `CacheFileError` (a ``ValueError``).
-        """
-        field, header, extra = self.cache.read(path)
-        if not planning.fits(field.shape, self.cache.shape):
-            raise CacheFileError(f"'{path}' holds a cache of {field.shape}, this integrator has {self.cache.shape}; "
-                                 "give it the same sizes")  # fmt: skip
-        self.check_file(path, header)
-        if scene is not None:
-            self.bind(scene, self._sensor(scene, 0), train=False)
-        known = self.state.signature
-        if known is not None and header.get("scene") != known:
-            raise CacheFileError(_other_scene(path))
-        try:
-            self.cache.resume(field, header, extra)
-        except (KeyError, TypeError, ValueError) as e:
-            raise damaged(path, e) from None
-        self.state.loaded, self.state.begun = (path, header.get("scene")), False
-        if field.shape != self.cache.shape:
-            self.cache.shape = field.shape
-            self.cache.clear_recordings()
-            self.film_state.passes.clear()
+    save_cache, load_cache = cache_files.save_cache, cache_files.load_cache
 
     # -------------------------------------------------------------------------------------------------------------
     # Rendering

@@ -1,7 +1,6 @@
 """Gradients of images through the cached integrators: against analysis, finite differences, and Mitsuba's ``prb``.
 
-Biased gradients may be off by 5 % of the gradient's norm beyond what noise explains. Unbiased ones are compared with
-``prb`` by Welch's test of each derivative, with Šidák's correction: one choice of seeds in ten thousand fails.
+Biased gradients may be off by 5 % of the gradient's norm beyond what noise explains.
 """
 
 import importlib
@@ -11,100 +10,23 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cheap import NETWORK, sweep
-from expectation import ERROR_RATE
-from scipy import stats
+from gradient_scenes import (
+    BY_CACHE,
+    CACHED,
+    SMALL,
+    T,
+    agree,
+    assert_is_difference,
+    black_wall,
+    gradients_of,
+    reference,
+    room,
+    spread_of,
+    tracked,
+    train,
+)
 
 from mi_neural import scenes
-
-T = mi.ScalarTransform4f
-SMALL = {"train_frames": 96, "train_samples": 1024, **NETWORK}
-CACHED = ("nirc", "nrc", "neural_path", "nirc_two_level")
-BY_CACHE = ("nirc", "nrc", "neural_path")
-
-
-def wall(at, axis, angle, bsdf, size=1.0, **keys):
-    return {"type": "rectangle", "to_world": T().translate(at).rotate(axis, angle).scale(size), "bsdf": bsdf, **keys}
-
-
-def colour(*rgb):
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
-
-
-def picture(n=4, low=0.2, high=0.8, seed=0):
-    values = np.random.default_rng(seed).uniform(low, high, (n, n, 3)).astype(np.float32)
-    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "filter_type": "nearest"}
-
-
-def room(block=None, width=12, **more):
-    """A room with a picture on its floor, an open front, a lamp and a small sun inside of it."""
-    eye = {"type": "perspective", "fov": 45, "to_world": T().look_at([0, 0, 3.2], [0, 0, 0], [0, 1, 0]),
-           "film": {"type": "hdrfilm", "width": width, "height": width, "rfilter": {"type": "box"},
-                    "pixel_format": "rgb"}}  # fmt: skip
-    return mi.load_dict({
-        "type": "scene", "eye": eye, "back": wall([0, 0, -1], [0, 1, 0], 0, colour(0.6, 0.6, 0.6)),
-        "floor": wall([0, -1, 0], [1, 0, 0], -90, {"type": "diffuse", "reflectance": picture()}),
-        "ceiling": wall([0, 1, 0], [1, 0, 0], 90, colour(0.7, 0.7, 0.7)),
-        "left": wall([-1, 0, 0], [0, 1, 0], 90, colour(0.7, 0.1, 0.1)),
-        "right": wall([1, 0, 0], [0, 1, 0], -90, colour(0.1, 0.6, 0.1)),
-        "block": {"type": "cube", "to_world": T().translate([0.3, -0.7, 0.1]).scale(0.3),
-                  "bsdf": block or colour(0.5, 0.5, 0.5)},
-        "lamp": wall([0, 0.98, 0], [1, 0, 0], 90, colour(0.1, 0.1, 0.1), 0.3,
-                     emitter={"type": "area", "radiance": {"type": "rgb", "value": [6, 5, 4]}}),
-        "spark": {"type": "point", "position": [-0.5, 0.2, 0.3], "intensity": 0.5}, **more,
-    })  # fmt: skip
-
-
-def tracked(scene, endings=("reflectance.value", "reflectance.data", "radiance.value", "intensity.value")):
-    """(parameters of `scene`, the keys with these endings, whose gradients are enabled)."""
-    params = mi.traverse(scene)
-    keys = sorted(k for k in params.keys() if k.endswith(tuple(endings)))  # their order differs from load to load
-    assert keys
-    for k in keys:
-        dr.enable_grad(params[k])
-    params.update()
-    return params, keys
-
-
-def adjoint_image(scene):
-    """What a loss says of the image: another factor for each pixel and colour, most of one sign."""
-    height, width = scene.sensors()[0].film().crop_size()
-    weights = np.random.default_rng(1).uniform(-0.2, 1, (height, width, 3))
-    return mi.TensorXf((weights / weights.size).astype(np.float32))
-
-
-def gradients_of(scene, params, keys, integrator, spp, seed, grad=None):
-    """The gradients of `keys` in one array, by a call to ``render_backward``."""
-    given = enable(params, keys)
-    integrator.render_backward(scene, params, adjoint_image(scene) if grad is None else grad, 0, seed, spp)
-    return np.concatenate([np.array(dr.grad(v), np.float64).ravel() for v in given])
-
-
-def enable(params, keys) -> list:
-    """The values of `keys`, given anew to the scene, which may keep what it computes from them (an environment map)."""
-    given = []
-    for k in keys:
-        value = type(params[k])(dr.detach(params[k]))
-        dr.enable_grad(value)
-        params[k] = value
-        given.append(value)
-    params.update()
-    return given
-
-
-def spread_of(scene, params, keys, integrator, spp, n=4):
-    """(mean gradients, their standard errors) over `n` seeds."""
-    runs = np.array([gradients_of(scene, params, keys, integrator, spp, 10 + s) for s in range(n)])
-    return runs.mean(0), runs.std(0, ddof=1) / n**0.5
-
-
-def agree(name, ours, theirs, allowed=0.05):
-    """The distance of two gradients (value, standard error), beyond that of noise, over the norm."""
-    (a, da), (b, db) = ours, theirs
-    noise = np.sum(da**2 + db**2)
-    off, norm = max(np.sum((a - b) ** 2) - noise, 0) ** 0.5, np.linalg.norm(b)
-    print(f"{name}: off by {off / norm:.2%} of the norm, noise {noise**0.5 / norm:.2%}")
-    assert noise**0.5 < 0.05 * norm, "the test says nothing"
-    assert off < allowed * norm
 
 
 @pytest.mark.parametrize("rr_depth", [1, 100])
@@ -124,13 +46,6 @@ def test_derivative_by_the_albedo_is_known_also_where_roulette_ends_paths(rr_dep
     found = float(np.sum(np.array(dr.grad(albedo)))) / float(np.sum(np.array(image)))
     print(f"derivative over the image {found:.3f} (known 4)")
     assert found == pytest.approx(4, rel=0.03)
-
-
-def train(scene, name, **keys):
-    integrator = mi.load_dict({"type": name, **SMALL, **keys})
-    with dr.suspend_grad():
-        integrator.train_first(scene)
-    return integrator
 
 
 # ---------------------------------------------------------------- what is known
@@ -157,20 +72,9 @@ def test_gradients_of_the_point_lit_sphere(name, keys):
 @pytest.mark.parametrize("keys", sweep([{}, {"light_sampler": {"type": "uniform_lights"}}], [{}]))
 def test_gradients_of_a_surface_that_is_all_black(keys):
     """Direct light and light from the cache, against a finite difference."""
-    scene = room(width=6)
-    key = "left.bsdf.reflectance.value"
-    params = mi.traverse(scene)
-    params[key] = mi.Color3f(0)
-    params.update()
+    scene, params, key = black_wall()
     found = gradients_of(scene, params, [key], train(scene, "nrc", **keys), 512, 1)
-    path, weight, images = mi.load_dict({"type": "path", "max_depth": 24}), np.array(adjoint_image(scene)), []
-    for value in (0.02, 0):
-        params[key] = mi.Color3f(value)
-        params.update()
-        images.append(np.sum(np.array(mi.render(scene, integrator=path, spp=4096, seed=3)) * weight, axis=(0, 1)))
-    expected = (images[0] - images[1]) / 0.02
-    print(found, expected)
-    np.testing.assert_allclose(found, expected, rtol=0.1)
+    assert_is_difference(scene, params, key, found, 24, 0.1)
 
 
 @pytest.mark.parametrize("records", [True, False])
@@ -219,33 +123,6 @@ def test_gradients_of_what_is_black():
 
 # ---------------------------------------------------------------- biased: within 5 % of prb's
 
-_REFERENCES = {}
-
-
-def scene_of(kind):
-    """(scene, parameters, keys) of a kind of room."""
-    glossy = {"type": "roughconductor", "alpha": {"type": "uniform", "value": 0.2}, "distribution": "ggx",
-              "specular_reflectance": {"type": "rgb", "value": 0.8}}  # fmt: skip
-    mask = {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "bsdf": colour(0.5, 0.5, 0.5)}}
-    sky = mi.Bitmap(np.random.default_rng(2).uniform(0, 1, (4, 8, 3)).astype(np.float32))
-    more = {"diffuse": {}, "glossy": {"block": glossy}, "mirror": {"block": {"type": "conductor"}},
-            "mask": {"block": mask}, "sky": {"sky": {"type": "envmap", "bitmap": sky}}}[kind]  # fmt: skip
-    scene = room(**more)
-    ends = ("reflectance.value", "reflectance.data", "radiance.value", "intensity.value", "alpha.value", "sky.data")
-    return scene, *tracked(scene, ends)
-
-
-def reference(kind):
-    """(scene, parameters, keys, gradients by ``prb`` and their errors), the last ones computed once.
-
-    No scene is kept: derivatives would be carried into the parameters of all scenes alive that want them.
-    """
-    scene, params, keys = scene_of(kind)
-    if kind not in _REFERENCES:
-        prb = mi.load_dict({"type": "prb", "max_depth": 24})
-        _REFERENCES[kind] = spread_of(scene, params, keys, prb, 1024)
-    return scene, params, keys, _REFERENCES[kind]
-
 
 @pytest.mark.parametrize("name, kind", sweep([
     (name, kind) for kind in ("diffuse", "glossy", "mirror", "mask", "sky") for name in BY_CACHE
@@ -260,73 +137,6 @@ def test_direct_light_at_the_end_is_traced_where_the_cache_lacks_it():
     scene, params, keys, theirs = reference("diffuse")
     integrator = train(scene, "nrc", cache_content="indirect")
     agree("nrc, indirect", spread_of(scene, params, keys, integrator, 128), theirs)
-
-
-# ---------------------------------------------------------------- unbiased: traced, with the mean of prb
-
-
-def assert_same_means(a, b, what: str) -> None:
-    """Two stacks of independent gradients, (n, number of derivatives), have the same mean."""
-    means, variances = zip(*((v.mean(0), v.var(0, ddof=1) / len(v)) for v in (a, b)), strict=True)
-    total = np.maximum(sum(variances), 1e-300)
-    dof = total**2 / np.maximum(sum(v**2 / (len(x) - 1) for v, x in zip(variances, (a, b), strict=True)), 1e-300)
-    each = 1 - (1 - ERROR_RATE) ** (1 / total.size)
-    norm = np.linalg.norm(means[1])
-    bound = stats.t.isf(each / 2, np.maximum(dof, 1)) * total**0.5 + 1e-6 * norm
-    off = np.abs(means[0] - means[1])
-    print(f"{what}: {off.size} derivatives, noise {total.sum() ** 0.5 / norm:.2%} of the norm; the "
-          f"worst {np.max(off / bound):.2f} of its bound, all bounds {np.linalg.norm(bound) / norm:.1%}")  # fmt: skip
-    assert (off <= bound).all()
-
-
-@pytest.mark.parametrize("kind, keys", sweep([
-    ("diffuse", {}), ("glossy", {"rr_depth": 2}), ("mirror", {"max_depth": 4}), ("mask", {"hide_emitters": True}),
-    ("sky", {"light_sampler": {"type": "tree_lights"}}), ("sky", {}),
-], [("glossy", {"rr_depth": 2}), ("sky", {"light_sampler": {"type": "tree_lights"}})]))  # fmt: skip
-def test_traced_gradients_have_the_mean_of_prb(kind, keys):
-    """By paths that may end early, with and without a light sampler; the cache is not trained and does not matter."""
-    scene, params, wanted = scene_of(kind)
-    limits = {"max_depth": 8, **{k: v for k, v in keys.items() if k != "light_sampler"}}
-    ours = mi.load_dict({"type": "nirc_two_level", **SMALL, **limits, **keys})
-    prb = mi.load_dict({"type": "prb", **limits})
-    a, b = (np.array([gradients_of(scene, params, wanted, x, 64, s) for s in range(12)]) for x in (ours, prb))
-    assert_same_means(a, b, f"{kind} {keys}")
-    assert ours.cache.steps == 0
-
-
-def test_traced_gradients_have_all_direct_light_on_black_surfaces():
-    """Against a finite difference; ``prb`` finds a part of it."""
-    scene = room(width=6)
-    key = "left.bsdf.reflectance.value"
-    params = mi.traverse(scene)
-    params[key] = mi.Color3f(0)
-    params.update()
-    ours = mi.load_dict({"type": "nirc_two_level", **SMALL, "max_depth": 2})
-    found = gradients_of(scene, params, [key], ours, 1024, 1)
-    path, weight, images = mi.load_dict({"type": "path", "max_depth": 2}), np.array(adjoint_image(scene)), []
-    for value in (0.02, 0):
-        params[key] = mi.Color3f(value)
-        params.update()
-        images.append(np.sum(np.array(mi.render(scene, integrator=path, spp=4096, seed=3)) * weight, axis=(0, 1)))
-    expected = (images[0] - images[1]) / 0.02
-    print(found, expected)
-    np.testing.assert_allclose(found, expected, rtol=0.05)
-
-
-# ---------------------------------------------------------------- unbiased: prb itself
-
-
-@pytest.mark.parametrize("keys", [{"type": "nirc_two_level", "gradient": "prb"}, {"type": "nrc", "gradient": "prb"},
-                                  {"type": "nirc", "max_depth": 2}])  # fmt: skip
-def test_without_the_cache_gradients_are_prbs_own(keys):
-    """By its key, and where no cache is needed."""
-    scene = room(width=6)
-    params, wanted = tracked(scene)
-    integrator = mi.load_dict({**SMALL, "rr_depth": 3, "hide_emitters": True, "max_depth": 6, **keys})
-    prb = mi.load_dict({"type": "prb", "max_depth": keys.get("max_depth", 6), "rr_depth": 3, "hide_emitters": True})
-    a, b = (gradients_of(scene, params, wanted, x, 16, 3) for x in (integrator, prb))
-    assert np.linalg.norm(a) > 0
-    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * np.abs(b).max())
 
 
 # ---------------------------------------------------------------- as Mitsuba's own
@@ -434,6 +244,7 @@ def test_gradients_are_recorded_once(name):
         mi.render(scene, params, integrator=integrator, spp=1, seed=seed)
         replayed = gradients_of(scene, params, keys, integrator, 4, seed)
     assert function.n_recordings <= known + 1
+
     def disturbed(*_):
         raise RuntimeError("another thread freed memory while a function was recorded")
 

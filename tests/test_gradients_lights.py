@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cheap import SLOW, sweep
+from gradient_scenes import T, adjoint_image, agree, colour, enable, room, spread_of, tracked, train, wall
 from light_scenes import at, glow, picture
-from test_gradients import T, adjoint_image, agree, colour, enable, room, spread_of, tracked, train, wall
 from test_gradients import warnings as warnings  # a fixture
 
 SAMPLERS = ("uniform_lights", "power_lights", "tree_lights", "nvc_lights")

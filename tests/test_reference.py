@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_denoise import has_denoiser
 
-from mi_neural.bench import benchmark, denoise, load, reference, terminal
+from mi_neural.bench import benchmark, denoise, judging, load, reference, terminal
 from mi_neural.bench.specs import parse_integrator
 from mi_neural.image import exr, metrics
 
@@ -119,10 +119,10 @@ def test_errors_against_a_smaller_reference_are_those_of_block_means():
     image = np.repeat(np.repeat(small, 2, axis=0), 2, axis=1) + noise  # right on average over every 2x2
     row = SimpleNamespace()
     known = reference.Reference(small.astype(np.float32), None, {}, None)
-    flip_map = benchmark.judge(row, [image], known)
+    flip_map = judging.judge(row, [image], known)
     assert row.relmse < 1e-9 and row.flip < 1e-3 and flip_map.shape == (4, 6)
     with pytest.raises(ValueError, match="no whole blocks"):
-        benchmark.judge(row, [image[:, :11]], known)
+        judging.judge(row, [image[:, :11]], known)
 
 
 def test_noise_of_the_reference_is_no_part_of_flip_against_the_denoised_one():
@@ -133,9 +133,9 @@ def test_noise_of_the_reference_is_no_part_of_flip_against_the_denoised_one():
     guides = denoise.Guides(image, np.zeros_like(image), clean=True)
     known = reference.Reference(image + noise, None, {}, None)
     row = SimpleNamespace()
-    benchmark.judge(row, [image], known)
+    judging.judge(row, [image], known)
     assert row.flip > 0.1 and not hasattr(row, "flip_clean")
-    benchmark.judge(row, [image], denoise.cleaned(known, guides))
+    judging.judge(row, [image], denoise.cleaned(known, guides))
     assert row.flip > 0.1 and row.flip_clean < 0.5 * row.flip
     smaller = reference.Reference(known.rgb[::2, ::2], None, {}, None)
     assert denoise.cleaned(smaller, guides).clean is None

@@ -13,7 +13,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from mi_neural import scenes
-from mi_neural.bench import benchmark, collection, curves, kept, load, reference, repeats, report, suite
+from mi_neural.bench import benchmark, collection, curves, judging, kept, load, reference, repeats, report, suite
 from mi_neural.bench.specs import parse_integrator
 from mi_neural.cli import app
 from mi_neural.image import exr, metrics
@@ -268,7 +268,7 @@ def test_recalled_row_costs_one_map(monkeypatch, tmp_path, rng):
     there = kept.Kept(tmp_path, {})
     there.add(made)
     pair = reference.Reference(known, None, {}, None, known)
-    expected = benchmark.judge(SimpleNamespace(), [exr.read(tmp_path / "path.exr").rgb], pair)
+    expected = judging.judge(SimpleNamespace(), [exr.read(tmp_path / "path.exr").rgb], pair)
     n, flip = [], metrics.flip
     monkeypatch.setattr(metrics, "flip", lambda *args: n.append(1) or flip(*args))
     monkeypatch.setattr(metrics, "relmse", None)

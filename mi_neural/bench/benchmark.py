@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import pairwise
 from statistics import median
 
 import numpy as np
@@ -33,6 +32,7 @@ from mi_neural.image import metrics
 
 from . import budget, denoise, memory, split
 from .budget import Rendered
+from .judging import averaged, judge, mean_relmse
 from .load import LoadedScene
 from .reference import Reference
 from .specs import IntegratorSpec, build_integrator, format_value
@@ -306,7 +306,7 @@ class Bench:
             row.peak_mib = memory.peak_mib() if self.counts_memory else None
             flip_map = None
             if mode == "curve":
-                row.relmse, row.relmse_trimmed = _relmse(_averaged(images, self.reference), self.reference)
+                row.relmse, row.relmse_trimmed = mean_relmse(averaged(images, self.reference), self.reference)
             elif mode != "split":
                 flip_map = judge(row, images, self.reference, self.exposures)
             shown = (None, None, None) if mode in WITHOUT_PICTURE else (frames[0], images[0], flip_map)
@@ -366,50 +366,6 @@ def make_row(
 
 def _name(case: Case, plan: Plan, repeat: int) -> str:
     return case.spec.label + (f", {repeat + 1} of {plan.repeats}" if plan.repeats > 1 else "")
-
-
-def judge(
-    row: Row, images: list[np.ndarray], reference: Reference | None, exposures: metrics.FlipExposures | None = None
-) -> np.ndarray | None:
-    """Fill in the row's errors and flicker; returns the FLIP map of the first image, None without a reference.
-
-    Images that are larger than the reference are averaged to its size for the errors.
-    """
-    if len(images) > 1:
-        row.flicker = float(np.mean([metrics.smape(b, a) for a, b in pairwise(images)]))
-    if reference is None:
-        return None
-    images = _averaged(images, reference)
-    row.relmse, row.relmse_trimmed = _relmse(images, reference)
-    found = [metrics.flip(image, reference.rgb, exposures) for image in images]
-    row.flip = float(np.mean([f.mean for f in found]))
-    if reference.clean is not None:
-        row.flip_clean = float(np.mean([metrics.flip(image, reference.clean, exposures).mean for image in images]))
-    return found[0].map
-
-
-def flip_map(
-    image: np.ndarray, reference: Reference | None, exposures: metrics.FlipExposures | None = None
-) -> np.ndarray | None:
-    """The map that :func:`judge` returns for this image, alone."""
-    if reference is None:
-        return None
-    (image,) = _averaged([image], reference)
-    return metrics.flip(image, reference.rgb, exposures).map
-
-
-def _averaged(images: list[np.ndarray], reference: Reference) -> list[np.ndarray]:
-    """The images at the reference's size, see :func:`.reference.load_reference`."""
-    return [metrics.block_means(image, reference.rgb.shape) for image in images]
-
-
-def _relmse(images: list[np.ndarray], reference: Reference) -> tuple[float, float]:
-    """relMSE and trimmed relMSE, means over the images, which have the reference's size."""
-    known = reference.rgb, reference.variance
-    return (
-        float(np.mean([metrics.relmse(image, *known) for image in images])),
-        float(np.mean([metrics.relmse_trimmed(image, *known) for image in images])),
-    )
 
 
 def make_cases(

@@ -10,8 +10,9 @@ import numpy as np
 
 from mi_neural.image import exr, metrics
 
-from .benchmark import Picture, Row, judge
+from .benchmark import Picture, Row
 from .budget import Rendered
+from .judging import judge
 from .load import InputError, LoadedScene, user_path
 from .reference import Reference, scale_between
 

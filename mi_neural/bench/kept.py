@@ -11,7 +11,8 @@ from pathlib import Path
 
 from mi_neural.image import exr
 
-from .benchmark import WITHOUT_PICTURE, Picture, Row, flip_map, plain
+from .benchmark import WITHOUT_PICTURE, Picture, Row, plain
+from .judging import flip_map
 from .reference import Reference
 
 FILE = "rows.jsonl"

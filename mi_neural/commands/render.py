@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from mi_neural.bench import benchmark, budget, cluster, denoise, environment, jobs, load, repeats, terminal
+from mi_neural.bench import benchmark, budget, cluster, denoise, environment, jobs, judging, load, repeats, terminal
 from mi_neural.bench import reference as references
 from mi_neural.bench.load import InputError
 from mi_neural.bench.specs import IntegratorSpec, parse_integrator, parse_keys
@@ -271,7 +271,7 @@ class Job:
         row = self.describe(rendered, image, seconds_denoise)
         terminal.write_image(wanted.output, row, image, rendered)
         if ref is not None:
-            benchmark.judge(row, [image], ref)
+            judging.judge(row, [image], ref)
             terminal.write_image(wanted.output, row, image, rendered)  # again, with the errors among its facts
         if wanted.json is not None:
             exr.write_text(wanted.json, json.dumps(row.to_json(), indent=1) + "\n")
