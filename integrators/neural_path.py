@@ -133,10 +133,14 @@ class NeuralPathIntegrator(OutgoingIntegrator):
         mixes = cached and not self.denoised
         if cached and self.denoised:
             threshold = dr.maximum(threshold, denoised_threshold(field.grid.mean_bias, steps, spp))
+            typical = field.field.typical_density()
 
         def stop(path, spread, smooth, first, sampler):
-            share = field.grid.share(*self.walk.place(path), spp, smooth) if mixes else mi.Float(0)
-            return share, smooth & ~first & spread.exceeds(threshold), mi.Bool(False), sampler
+            c, place = threshold, self.walk.place(path)
+            if self.denoised:  # what was learned from few records is traced past
+                c = c * dr.maximum(typical / dr.maximum(field.field.density_at(place[0]), 1e-30), 1)
+            share = field.grid.share(*place, spp, smooth) if mixes else mi.Float(0)
+            return share, smooth & ~first & spread.exceeds(c), mi.Bool(False), sampler
 
         looks = mixes or (cached and shows)
         end, sampler = prefix.trace(

@@ -23,6 +23,7 @@ from mi_neural.bench.specs import IntegratorSpec, build_integrator, parse_integr
 from mi_neural.caches.accuracy import Accuracy, AccuracyShape, Pairs, pairs_of
 from mi_neural.caches.field import CacheFileError
 from mi_neural.caches.outgoing import OutgoingTraining, training_paths
+from mi_neural.caches.outgoing_field import OutgoingField, OutgoingShape
 from mi_neural.estimators.spread import grown
 from mi_neural.integrators.neural_path import ENDS, LEAST_BIAS, LEAST_STEPS, YOUNG, denoised_threshold
 from mi_neural.render.kernels import on_gpu
@@ -67,6 +68,13 @@ def force(integrator, noise=1.0, bias=1e9, mean_bias=0.0) -> None:
     grid.mean_bias = mi.Float(mean_bias)
     grid.noise, grid.bias = (dr.full(mi.Float, v, grid.constants.n_entries) for v in (noise, bias))
     dr.make_opaque(grid)
+
+
+def lay_records(integrator, density) -> None:
+    """Let as many training records lie in the cells as ``density(k)`` says of the table's entries k."""
+    field = integrator.cache.queried.field
+    field.density = mi.Float(density(np.arange(dr.width(field.density))) * np.ones(dr.width(field.density)))
+    dr.make_opaque(field)
 
 
 # ---------------------------------------------------------------- what is measured
@@ -271,6 +279,7 @@ def test_denoised_images_learn_from_more_paths_without_an_end():
 def test_cache_at_later_vertices_is_nrc(trained, box, tmp_path, denoised):
     integrator = copy_of(trained, box, tmp_path, denoised=denoised)
     force(integrator, mean_bias=0.6)
+    lay_records(integrator, lambda k: 1.0)
     ours = renders(box, integrator, 24, 32)
     c = denoised_threshold(0.6, trained.cache.steps, 32) if denoised else grown(0.01, 32)
     assert (c > 5) == denoised
@@ -360,6 +369,31 @@ def test_young_cache_is_traced_past_in_denoised_images(box):
     far = render(box, auto(spread_threshold=math.inf, channels="depth", freeze_cache=True), 64)[..., 3].mean()
     print(f"depth {depths}, traced {far}")
     assert depths[8] > 0.9 * far and depths[200] < 0.7 * far
+
+
+def test_denoised_images_trace_past_places_with_few_training_records(trained, box, tmp_path):
+    """Where a thousandth of the usual number lies, paths hardly end; without a denoiser that changes nothing."""
+    depths = {}
+    for denoised in (False, True):
+        integrator = copy_of(trained, box, tmp_path, denoised=denoised, channels="depth")
+        force(integrator, mean_bias=0.02)
+        for name, density in (("even", lambda k: 1.0), ("none", lambda k: 0.0),
+                              ("few", lambda k: np.where(k % 16, 1e-3, 1.0))):  # fmt: skip
+            lay_records(integrator, density)
+            depths[denoised, name] = render(box, integrator, 16)[..., 3].mean()
+    print(depths)
+    assert depths[False, "even"] == depths[False, "none"] == depths[False, "few"]
+    assert depths[True, "even"] == depths[True, "none"]  # of a cache file that does not say
+    assert depths[True, "few"] > 1.5 * depths[True, "even"]
+
+
+def test_typical_density_is_that_near_records():
+    field = OutgoingField(*BOX, OutgoingShape(n_levels=2, hashmap_size=64, width=16))
+    assert field.typical_density()[0] == 0
+    points = np.repeat([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]], [30, 10], axis=0)
+    field.count(mi.Point3f(points.T.astype(np.float32)), mi.Bool(True), mi.Float(0))
+    assert field.density_at(mi.Point3f(0.1))[0] == 30
+    assert field.typical_density()[0] == pytest.approx((30 * 30 + 10 * 10) / 40)
 
 
 # ---------------------------------------------------------------- state

@@ -268,6 +268,10 @@ class OutgoingField(TrainedField):
         """Mean number of training records per step in the cell of `x`."""
         return dr.gather(mi.Float, self.density, self._cell(x))
 
+    def typical_density(self):
+        """Mean of :meth:`density_at` over the training records themselves, 1-wide; 0 before the first."""
+        return dr.sum(dr.square(self.density)) / dr.maximum(dr.sum(self.density), 1e-30)
+
     # -------------------------------------------------------------------------------------------------------------
     # State and files
 
