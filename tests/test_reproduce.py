@@ -175,5 +175,45 @@ def test_renderer_of_ones_own_learns_the_light_and_notices_a_change(tmp_path):
     assert part.arrays["image_0"].shape == (16, 16, 3) and part.numbers["flicker"][0] is None
 
 
+def test_interrupted_part_goes_on_inside_of_it(tmp_path, monkeypatch):
+    """Frames that were rendered are not rendered again, and the result is that without an interruption."""
+    settings = fsr.Settings((8, 8), before=6, after=2, truth=64)
+    whole = fsr.run(Work(tmp_path / "whole").group("fsr", settings), settings, 0.01, 0.9, 1.0)
+
+    def stop_after(n: int):
+        def progress(text):
+            def bar(done, total):
+                if text.startswith("rate") and done == n:
+                    raise KeyboardInterrupt
+
+            return bar
+
+        return progress
+
+    frames, frame = [], fsr.Renderer.frame
+    monkeypatch.setattr(fsr.Renderer, "frame", lambda self, seed, *a: (frames.append(seed), frame(self, seed, *a))[1])
+    for n in (3, 7):
+        with pytest.raises(KeyboardInterrupt):
+            fsr.run(Work(tmp_path / "cut", progress=stop_after(n)).group("fsr", settings), settings, 0.01, 0.9, 1.0)
+    group = Work(tmp_path / "cut").group("fsr", settings)
+    part = fsr.run(group, settings, 0.01, 0.9, 1.0)
+    assert frames == list(range(1, 9))
+    for name in ("error", "flicker"):
+        assert part.numbers[name][1:] == pytest.approx(whole.numbers[name][1:], rel=1e-3), name
+    assert part.arrays.keys() == whole.arrays.keys() and len(part.numbers["error"]) == 8
+    assert not list(group.folder.glob("*unfinished*"))
+
+
+def test_damaged_rest_of_an_interrupted_part_is_measured_again(tmp_path):
+    unfinished = Work(tmp_path).group("some", {"size": (1, 1)}).unfinished("part")
+    assert unfinished.read() is None
+    unfinished.keep(lambda: Part({"error": [1.0, None]}, {"image": np.ones(3)}))
+    assert not unfinished.path.exists(), "kept too soon"
+    unfinished.keep(lambda: Part({"error": [1.0, None]}, {"image": np.ones(3)}), now=True)
+    assert unfinished.read().numbers == {"error": [1.0, None]} and unfinished.read().arrays["image"].sum() == 3
+    unfinished.path.write_bytes(unfinished.path.read_bytes()[:50])
+    assert unfinished.read() is None
+
+
 def test_quick_entries_are_said_to_take_less_than_two_minutes():
     assert all(0 < quick < 120 and quick < full for quick, full in (e.seconds for e in registry.ENTRIES.values()))

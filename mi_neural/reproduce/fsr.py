@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -144,23 +145,76 @@ def run(group: Group, settings: Settings, rate: float, smoothing: float, share: 
         loaded, over_time = _scene(settings)
         truths = [group.part(f"truth_{k}", lambda b, k=k: _truth(settings, k)).arrays["image"] for k in range(2)]
         renderer = Renderer(loaded.scene, max(8, round(share * settings.size[0] * settings.size[1])), settings.vertices)
-        errors, flicker, seconds, previous, kept = [], [], [], None, {}
-        for frame in range(settings.before + settings.after):
-            over_time.apply(int(frame >= settings.before))
-            start = time.process_time()
-            image = renderer.frame(frame + 1, rate, smoothing)
-            seconds.append((time.process_time() - start) / environment.cores())
-            errors.append(metrics.relmse_trimmed(image, truths[frame >= settings.before]))
-            flicker.append(None if previous is None else metrics.smape(image, previous))
-            previous = image
-            if frame in (settings.before - 1, settings.before + min(10, settings.after - 1)):
-                kept[f"image_{len(kept)}"] = image.astype(np.float32)
-            if bar:
-                bar(frame + 1, settings.before + settings.after)
+        found, n_frames = Frames(renderer), settings.before + settings.after
+        unfinished = group.unfinished(name)
+        if (kept := unfinished.read()) is not None:
+            found.go_on(kept, unfinished.path.parent)
+        try:
+            for frame in range(len(found.errors), n_frames):
+                over_time.apply(int(frame >= settings.before))
+                image = found.render(frame, rate, smoothing, truths[frame >= settings.before])
+                if frame in (settings.before - 1, settings.before + min(10, settings.after - 1)):
+                    found.shown[f"image_{len(found.shown)}"] = image.astype(np.float32)
+                unfinished.keep(lambda: found.so_far(unfinished.path.parent))
+                if bar:
+                    bar(frame + 1, n_frames)
+        except KeyboardInterrupt:
+            if found.between_frames:
+                unfinished.keep(lambda: found.so_far(unfinished.path.parent), now=True)
+            raise
         over_time.restore()
-        return Part({"error": errors, "flicker": flicker, "seconds": float(np.median(seconds))}, kept)
+        return Part({"error": found.errors, "flicker": found.flicker, "seconds": float(np.median(found.seconds))},
+                    found.shown)  # fmt: skip
 
-    return group.part(f"rate_{rate:g}_smoothing_{smoothing:g}_share_{share:g}", measure)
+    name = f"rate_{rate:g}_smoothing_{smoothing:g}_share_{share:g}"
+    return group.part(name, measure)
+
+
+class Frames:
+    """Frames of a renderer so far: error, flicker (None for the first) and seconds of each, and the images to show."""
+
+    LISTS = ("errors", "flicker", "seconds")
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.renderer, self.shown, self.previous = renderer, {}, None
+        self.errors: list[float] = []
+        self.flicker: list[float | None] = []
+        self.seconds: list[float] = []
+
+    def render(self, frame: int, rate: float, smoothing: float, truth: np.ndarray) -> np.ndarray:
+        """The next frame, measured against `truth`."""
+        start = time.process_time()
+        image = self.renderer.frame(frame + 1, rate, smoothing)
+        self.seconds.append((time.process_time() - start) / environment.cores())
+        self.flicker.append(None if self.previous is None else metrics.smape(image, self.previous))
+        self.errors.append(metrics.relmse_trimmed(image, truth))  # last: it says that the frame is done
+        self.previous = image
+        return image
+
+    @property
+    def between_frames(self) -> bool:
+        """Whether the cache has learned from the frames that are noted and from no other: one step each."""
+        return self.renderer.cache.field.steps == len(self.errors) > 0
+
+    def so_far(self, folder: Path) -> Part:
+        """All of this, to be kept. A file for a moment in `folder`."""
+        path = folder / "cache.npz"
+        self.renderer.cache.save(str(path))
+        cache = np.frombuffer(path.read_bytes(), np.uint8)
+        path.unlink()
+        numbers = {name: getattr(self, name) for name in self.LISTS}
+        return Part(numbers, {"cache": cache, "previous": self.previous, **self.shown})
+
+    def go_on(self, kept: Part, folder: Path) -> None:
+        """Go on from what :meth:`so_far` gave."""
+        for name in self.LISTS:
+            setattr(self, name, list(kept.numbers[name]))
+        path = folder / "cache.npz"
+        path.write_bytes(kept.arrays["cache"].tobytes())
+        self.renderer.cache = RadianceCache.load(str(path))
+        path.unlink()
+        self.previous = kept.arrays["previous"]
+        self.shown = {k: v for k, v in kept.arrays.items() if k.startswith("image_")}
 
 
 def _scene(settings: Settings):

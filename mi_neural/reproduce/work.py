@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
+import time
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -29,6 +30,35 @@ class Part:
 
     numbers: dict[str, Any] = field(default_factory=dict)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+#: Seconds after which a part that is being measured is kept again.
+KEEP_SECONDS = 20.0
+
+
+class Unfinished:
+    """What a part has found so far, so that an interrupted command goes on inside of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._kept = path, time.monotonic()
+
+    def read(self) -> Part | None:
+        """What was kept; None where nothing was, or where the file is damaged."""
+        try:
+            with open(self.path, "rb") as file, np.load(file) as kept:
+                arrays = dict(kept)
+            return Part(json.loads(str(arrays.pop("numbers"))), arrays)
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+            return None
+
+    def keep(self, found: Callable[[], Part], now: bool = False) -> None:
+        """Write what `found` gives, if :data:`KEEP_SECONDS` have passed since the last time, or `now`."""
+        if not now and time.monotonic() - self._kept < KEEP_SECONDS:
+            return
+        part = found()
+        with exr.replacing(self.path) as temporary:
+            np.savez(temporary, numbers=json.dumps(plain(part.numbers)), **part.arrays)
+        self._kept = time.monotonic()
 
 
 class Group:
@@ -63,7 +93,12 @@ class Group:
             with exr.replacing(path.with_suffix(".npz")) as temporary:
                 np.savez(temporary, **found.arrays)
         exr.write_text(path, json.dumps(numbers, indent=1) + "\n")  # last: it says that the part is finished
+        self.unfinished(name).path.unlink(missing_ok=True)
         return Part(numbers, found.arrays)
+
+    def unfinished(self, name: str) -> Unfinished:
+        """Where the part of this name may keep what it has, while it is measured."""
+        return Unfinished(self.folder / f"{name}.unfinished.npz")
 
 
 class Work:
