@@ -13,12 +13,12 @@ A file with `figure` describes a picture in the same way.
 In Markdown a table stands between `<!-- results: NAME -->` and `<!-- end -->`. A table whose numbers were not measured
 (defaults, versions) follows a line `<!-- no results: REASON -->`.
 
-A number in prose is written from the mark behind it: `0.5<!-- value: NAME > ROW > COLUMN -->`. ROW is the first cell of
-a row, and further ones behind it where it takes them to tell rows apart, with `;` between them; an empty cell counts as
-that above it. COLUMN is the column's title; of a list of numbers, `; 2` behind it takes the second. `*` stands for any
-text, and backticks are left out. ` / ` and the end of a second address (COLUMN, ROW > COLUMN or all) make a ratio.
-`mean`, `least` and `most` in place of `value` take several rows: their geometric mean, or one of them.
-For example: `?<!-- mean: public_denoised > *; frame of 1 s > neural_path; 1 / path; 1 -->`.
+A number in prose is written from the mark behind it: `0.5<!-- value: NAME; ROW; COLUMN -->`. ROW is the first cell of a
+row, or `CELL&CELL` where it takes the second one, too, to tell rows apart; an empty cell counts as that above it.
+COLUMN is the column's title; of a list of numbers, `COLUMN#2` takes the second. `*` stands for any text, and backticks
+are left out. ` / ` and the end of a second address (COLUMN, ROW; COLUMN or all) make a ratio. `mean`, `least` and
+`most` in place of `value` take several rows: their geometric mean, or one of them. For example:
+`?<!-- mean: public_denoised; *&frame of 1 s; neural_path#1 / path#1 -->`.
 A paragraph with numbers of others contains, or follows, `<!-- no results: REASON -->`.
 """
 
@@ -207,7 +207,7 @@ def value(address: str, kind: str = "value") -> str:
     address = " ".join(address.split())
     over, ratio, under = (part.strip() for part in address.partition(" / "))
     try:
-        parts, further = over.split(" > "), under.split(" > ")
+        parts, further = over.split("; "), under.split("; ")
         numbers = _numbers(parts)
         if ratio:
             divisors = _numbers(parts[: max(len(parts) - len(further), 0)] + further)
@@ -231,18 +231,18 @@ def value(address: str, kind: str = "value") -> str:
 def _numbers(parts: list[str]) -> list[str]:
     """The number in each row that an address names; '' where a cell has none."""
     if len(parts) != 3:
-        raise ResultsError("a figure is named by NAME > ROW > COLUMN")
+        raise ResultsError("a figure is named by NAME; ROW; COLUMN")
     found = read(parts[0])
     lines, above = [], []
     for row in rows(found):
         above = [above[k] if cell == "" and above else str(cell) for k, cell in enumerate(row["cells"])]
         lines.append((above, row["cells"]))
-    wanted = [_pattern(cell) for cell in parts[1].split(";")]
+    wanted = [_pattern(cell) for cell in parts[1].split("&")]
     chosen = [cells for names, cells in lines if _named(wanted, names)]
     if not chosen:
-        known = ", ".join("; ".join(map(_plain, names[:2])) for names, _ in lines)
+        known = ", ".join("&".join(map(_plain, names[:2])) for names, _ in lines)
         raise ResultsError(f"no row is '{parts[1]}'; rows: {known}")
-    title, _, place = parts[2].partition(";")
+    title, _, place = parts[2].partition("#")
     columns = [k for k, name in enumerate(found["columns"]) if _pattern(title).fullmatch(_plain(name))]
     if len(columns) != 1:
         known = ", ".join(filter(None, map(_plain, found["columns"])))
@@ -258,8 +258,8 @@ def _number(cell, place: str) -> str:
     values = _values(cell)
     if not values:
         return ""
-    if int(place or 1) > len(values) or (len(values) > 1 and not place):
-        raise ResultsError(f"the cell has {len(values)} numbers; write ; 1 to ; {len(values)} behind the column")
+    if (len(values) > 1 or place) and place not in map(str, range(1, len(values) + 1)):
+        raise ResultsError(f"the cell has {len(values)} numbers; write #1 to #{len(values)} behind the column")
     return values[int(place or 1) - 1]
 
 
