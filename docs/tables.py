@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs/results"
 BLOCK = re.compile(r"^( *)<!-- results: (\S+) -->\n(.*?)^ *<!-- end -->$", re.M | re.S)
 EXEMPT = re.compile(r"<!-- no results: \S.* -->")
-VALUE = re.compile(r"((?<![\w.])-?\d*\.?\d+(?:e[-+]?\d+)?|\?)?<!-- (value|mean|least|most): (.*?) -->", re.S)
+VALUE = re.compile(r"((?<![\w.])-?\d*\.?\d+(?:e[-+]?\d+)?|\?)?(<!--\s+(value|mean|least|most):\s+(.*?)\s+-->)", re.S)
 #: What is no prose: code, links, the time of a frame or shot, versions.
 NO_PROSE = re.compile(r"^```(?s:.*?)^```$|(?:\A|\n\s*\n)(?: {4}(?! *[-*|] ).*(?:\n|\Z))+|``?[^`]+``?|\]\([^)]*\)|"
                       r"doi:\S+|(?:frame|shot)s? of [\d.]+ s\b|(?:[Vv]ersion|Python|Mitsuba)\s[\d.]*\d", re.M)  # fmt: skip
@@ -176,8 +176,8 @@ def rewritten(text: str, page: Path) -> str:
 
     def figure(found: re.Match) -> str:
         if found[1] is None:
-            raise ResultsError(f"{page.name}: '{found[3]}' stands behind no number; write ? before its mark")
-        return f"{value(found[3], found[2])}<!-- {found[2]}: {found[3]} -->"
+            raise ResultsError(f"{page.name}: '{found[4]}' stands behind no number; write ? before its mark")
+        return value(found[4], found[3]) + found[2]
 
     text = BLOCK.sub(
         lambda m: f"{m[1]}<!-- results: {m[2]} -->\n{written(m[2], page, m[1])}{m[1]}<!-- end -->", text
@@ -255,7 +255,7 @@ def _named(wanted: list[re.Pattern], names: list[str]) -> bool:
 
 
 def _number(cell, place: str) -> str:
-    values = _values(cell)
+    values = _values(cell) or ([cell] if re.fullmatch(r"-?[\d.]+", str(cell)) else [])
     if not values:
         return ""
     if (len(values) > 1 or place) and place not in map(str, range(1, len(values) + 1)):

@@ -119,7 +119,7 @@ def test_loose_tables_are_found(tables):
 
 COLUMNS = '["", "", "`path`", "`nrc`, c = 1", "ms: query"]'
 ROWS = """[["door", "frame of 1 s", [0.50, 0.10], [0.30, 0.05], 4], ["", "shot", [0.20, 0.20], [0.05, 0.20], 130],
-    ["lamp", "frame of 1 s", 4, "", "4 ms"], ["two lamps", "shot", 0.8, 0.2, 0.40]]"""
+    ["lamp", "frame of 1 s", 4, "", "4 ms"], ["two lamps", "shot", 0.8, 0.2, "0.40"]]"""
 
 
 def value(own, tables, address: str, kind: str = "value") -> str:
@@ -136,6 +136,7 @@ def value(own, tables, address: str, kind: str = "value") -> str:
         ("mine; door&shot; ms: query", "130"),
         ("mine; door&frame of 1 s; path#1", "0.50"),
         ("mine; two*; path", "0.8"),
+        ("mine; two lamps; ms*", "0.40"),
         ("mine; door&shot;\n  nrc*#2", "0.20"),
         ("mine; door&shot; nrc*#1 / path#1", "0.25"),
         ("mine; door&shot; ms* / door&frame*; ms*", "32"),
@@ -191,8 +192,10 @@ def test_a_mark_may_be_broken_at_every_space(tables):
     """No line of it begins a list or a quotation, whichever way an editor wraps the paragraph."""
     marks = {m[0] for page in tables.pages() for m in tables.VALUE.finditer(page.read_text(encoding="utf-8"))}
     for mark in {*marks, "1.5<!-- most: mine; *&shot; nrc*#1 / *; path#1 -->"}:
-        html = MarkdownIt().render("\n".join(f"It has {mark}, less.".split()))
+        text = "\n".join(f"It has {mark}, less.".split())
+        html = MarkdownIt().render(text)
         assert html.startswith("<p>It\nhas\n") and html.count("<") == 3 and html.endswith("less.</p>\n"), mark
+        assert tables.VALUE.sub("", text) == "It\nhas\n,\nless."
 
 
 @pytest.mark.parametrize(
