@@ -42,7 +42,8 @@ EXEMPT = re.compile(r"<!-- no results: \S.* -->")
 VALUE = re.compile(r"((?<![\w.])-?\d*\.?\d+(?:e[-+]?\d+)?|\?)?(<!--\s+(value|mean|least|most):\s+(.*?)\s+-->)", re.S)
 #: What is no prose: code, links, the time of a frame or shot, versions.
 NO_PROSE = re.compile(r"^```(?s:.*?)^```$|(?:\A|\n\s*\n)(?: {4}(?! *[-*|] ).*(?:\n|\Z))+|``?[^`]+``?|\]\([^)]*\)|"
-                      r"doi:\S+|(?:frame|shot)s? of [\d.]+ s\b|(?:[Vv]ersion|Python|Mitsuba)\s[\d.]*\d", re.M)  # fmt: skip
+                      r"doi:\S+|\b(?:frames?|shots?)\sof\s[\d.]+ s\b|(?:[Vv]ersion|Python|Mitsuba)\s[\d.]*\d",
+                      re.M)  # fmt: skip
 UNIT = r"(?: ?%|\s(?:ms|us|ns|s|seconds|MiB|GiB|MB|times)\b)"
 #: What seems measured: decimals, and numbers of percent, times, seconds, memory.
 FIGURE = re.compile(rf"(?<![\w.-])[\d,]*(?:\.\d+(?:e[-+]?\d+)?|\de-\d+|\d(?={UNIT})){UNIT}?")

@@ -23,6 +23,12 @@ def test_no_measured_table_stands_outside_of_the_marks(tables):
         assert not tables.loose_tables(page.read_text(encoding="utf-8")), page.name
 
 
+def test_no_measured_figure_stands_in_prose(tables):
+    """Settings are written as code (`0.03`), figures of others after `<!-- no results: REASON -->`."""
+    found = {page.name: tables.loose_figures(page.read_text(encoding="utf-8")) for page in tables.pages()}
+    assert not {name: figures for name, figures in found.items() if figures}
+
+
 def test_every_picture_of_a_page_is_a_result(tables):
     for page in tables.pages():
         assert "](" not in re.sub(r"(?<!!)\[[^\]]*\]\(", "", tables.BLOCK.sub("", page.read_text(encoding="utf-8")))
