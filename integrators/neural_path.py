@@ -137,7 +137,7 @@ class NeuralPathIntegrator(OutgoingIntegrator):
 
         def stop(path, spread, smooth, first, sampler):
             c, place = threshold, self.walk.place(path)
-            if self.denoised:  # what was learned from few records is traced past
+            if self.denoised:  # what was learned from few records is wrong more often, and a denoiser keeps it
                 c = c * dr.maximum(typical / dr.maximum(field.field.density_at(place[0]), 1e-30), 1)
             share = field.grid.share(*place, spp, smooth) if mixes else mi.Float(0)
             return share, smooth & ~first & spread.exceeds(c), mi.Bool(False), sampler
@@ -212,7 +212,8 @@ NeuralPathIntegrator.__doc__ = (
        - |bool|
        - The image will be denoised: the first surface does not show the cache, and ``spread_threshold`` is raised to
          :math:`0.3 N b^2` and, after few training steps t, to :math:`(N b^2 (60/t)^4)^{3/2}` where that is more. b² is
-         the mean of the scene, at least 0.001. (Default: false)
+         the mean of the scene, at least 0.001. Where fewer training records lie than is usual, it is raised by that
+         factor. (Default: false)
      * - spread_threshold
        - |float|
        - Constant c of the spread test a > c a_0 of later vertices (Müller et al. 2021, sec. 3.4), raised to N/256 where

@@ -6,7 +6,7 @@ import difflib
 
 from mi_neural.bench.load import InputError
 
-from . import fsr, made_scenes, nirc, nirc_images, nvc, nvc_settings, reliability
+from . import fsr, made_scenes, nirc, nirc_images, nvc, nvc_settings, reliability, reliability_times
 from .entry import SOURCES, Entry
 
 
@@ -21,6 +21,7 @@ ENTRIES: dict[str, Entry] = {
     entry.name: entry
     for entry in (
         *reliability.ENTRIES,
+        *reliability_times.ENTRIES,
         *_of("nirc", nirc, nirc_images, made_scenes),
         *_of("nvc", nvc, nvc_settings, made_scenes),
         *fsr.ENTRIES,
