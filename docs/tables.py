@@ -46,7 +46,7 @@ NO_PROSE = re.compile(r"^```(?s:.*?)^```$|(?:\A|\n\s*\n)(?: {4}(?! *[-*|] ).*(?:
                       re.M)  # fmt: skip
 UNIT = r"(?: ?%|\s(?:ms|us|ns|s|seconds|MiB|GiB|MB|times)\b)"
 #: What seems measured: decimals, and numbers of percent, times, seconds, memory.
-FIGURE = re.compile(rf"(?<![\w.-])[\d,]*(?:\.\d+(?:e[-+]?\d+)?|\de-\d+|\d(?={UNIT})){UNIT}?")
+FIGURE = re.compile(rf"(?<![\w.])-?[\d,]*(?:\.\d+(?:e[-+]?\d+)?|\de-\d+|\d(?={UNIT})){UNIT}?")
 SOURCE = ("commit", "date", "machine", "mitsuba", "command", "paths")
 WIDTH = 150
 

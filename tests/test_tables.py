@@ -209,6 +209,7 @@ def test_a_mark_may_be_broken_at_every_space(tables):
     [
         ("The error is 0.48 there.", ["0.48"]),
         ("less by 13 %, or 5%", ["13 %", "5%"]),
+        ("from -0.5 to -10 %, 1/2.8, 2-3 %", ["-0.5", "-10 %", "2.8", "3 %"]),
         ("it takes 12 ms, 3 s and\n40 MiB, 5 times as much", ["12 ms", "3 s", "40 MiB", "5 times"]),
         ("- one .0022\n- two 2e-05", [".0022", "2e-05"]),
         ("0.48<!-- value: a; b; c -->", []),
