@@ -12,11 +12,20 @@ A file with `figure` describes a picture in the same way.
 
 In Markdown a table stands between `<!-- results: NAME -->` and `<!-- end -->`. A table whose numbers were not measured
 (defaults, versions) follows a line `<!-- no results: REASON -->`.
+
+A number in prose is written from the mark behind it: `0.5<!-- value: NAME; ROW; COLUMN -->`. ROW is the first cell of a
+row, or `CELL&CELL` where it takes the second one, too, to tell rows apart; an empty cell counts as that above it.
+COLUMN is the column's title; of a list of numbers, `COLUMN#2` takes the second. `*` stands for any text, and backticks
+are left out. ` / ` and the end of a second address (COLUMN, ROW; COLUMN or all) make a ratio. `mean`, `least` and
+`most` in place of `value` take several rows: their geometric mean, or one of them. For example:
+`?<!-- mean: public_denoised; *&frame of 1 s; neural_path#1 / path#1 -->`.
+A paragraph with numbers of others contains, or follows, `<!-- no results: REASON -->`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import subprocess
@@ -30,6 +39,14 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs/results"
 BLOCK = re.compile(r"^( *)<!-- results: (\S+) -->\n(.*?)^ *<!-- end -->$", re.M | re.S)
 EXEMPT = re.compile(r"<!-- no results: \S.* -->")
+VALUE = re.compile(r"((?<![\w.])-?\d*\.?\d+(?:e[-+]?\d+)?|\?)?(<!--\s+(value|mean|least|most):\s+(.*?)\s+-->)", re.S)
+#: What is no prose: code, links, the time of a frame or shot, versions.
+NO_PROSE = re.compile(r"^```(?s:.*?)^```$|(?:\A|\n\s*\n)(?: {4}(?! *[-*|] ).*(?:\n|\Z))+|``?[^`]+``?|\]\([^)]*\)|"
+                      r"doi:\S+|\b(?:frames?|shots?)\sof\s[\d.]+ s\b|(?:[Vv]ersion|Python|Mitsuba)\s[\d.]*\d",
+                      re.M)  # fmt: skip
+UNIT = r"(?: ?%|\s(?:ms|us|ns|s|seconds|MiB|GiB|MB|times)\b)"
+#: What seems measured: decimals, and numbers of percent, times, seconds, memory.
+FIGURE = re.compile(rf"(?<![\w.])-?[\d,]*(?:\.\d+(?:e[-+]?\d+)?|\de-\d+|\d(?={UNIT})){UNIT}?")
 SOURCE = ("commit", "date", "machine", "mitsuba", "command", "paths")
 WIDTH = 150
 
@@ -156,10 +173,17 @@ def _values(cell) -> list[Number]:
 
 
 def rewritten(text: str, page: Path) -> str:
-    """The Markdown of a page with its tables as the results have them."""
-    return BLOCK.sub(
+    """The Markdown of a page with its tables, and the numbers of its prose, as the results have them."""
+
+    def figure(found: re.Match) -> str:
+        if found[1] is None:
+            raise ResultsError(f"{page.name}: '{found[4]}' stands behind no number; write ? before its mark")
+        return value(found[4], found[3]) + found[2]
+
+    text = BLOCK.sub(
         lambda m: f"{m[1]}<!-- results: {m[2]} -->\n{written(m[2], page, m[1])}{m[1]}<!-- end -->", text
     )
+    return VALUE.sub(figure, text)
 
 
 def loose_tables(text: str) -> list[str]:
@@ -172,6 +196,100 @@ def loose_tables(text: str) -> list[str]:
             end = next((n for n in range(k, len(lines)) if not lines[n].lstrip().startswith("|")), len(lines))
             if any(re.search(r"\d", re.sub(r"`[^`]*`", "", row)) for row in lines[k:end]):
                 found.append(line)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# Prose
+
+
+def value(address: str, kind: str = "value") -> str:
+    """The number at an address; with `mean`, `least` or `most`, of several rows. Raises `ResultsError`."""
+    address = " ".join(address.split())
+    over, ratio, under = (part.strip() for part in address.partition(" / "))
+    try:
+        parts, further = over.split("; "), under.split("; ")
+        numbers = _numbers(parts)
+        if ratio:
+            divisors = _numbers(parts[: max(len(parts) - len(further), 0)] + further)
+            if len(divisors) != len(numbers):
+                raise ResultsError(f"{len(numbers)} rows over {len(divisors)}")
+            numbers = [float(a) / float(b) if a and b else "" for a, b in zip(numbers, divisors, strict=True)]
+        if kind == "value" and len(numbers) > 1:
+            raise ResultsError(f"{len(numbers)} rows are '{parts[1]}'; name one, or write mean, least or most")
+        numbers = [number for number in numbers if number != ""]
+        if not numbers:
+            raise ResultsError("the cell has no number")
+    except ResultsError as error:
+        raise ResultsError(f"'{address}': {error}") from None
+    if kind == "mean":
+        found = math.exp(sum(math.log(float(n)) for n in numbers) / len(numbers))
+    else:
+        found = max(numbers, key=float) if kind == "most" else min(numbers, key=float)
+    return found if isinstance(found, str) else _short(found)
+
+
+def _numbers(parts: list[str]) -> list[str]:
+    """The number in each row that an address names; '' where a cell has none."""
+    if len(parts) != 3:
+        raise ResultsError("a figure is named by NAME; ROW; COLUMN")
+    found = read(parts[0])
+    lines, above = [], []
+    for row in rows(found):
+        above = [above[k] if cell == "" and above else str(cell) for k, cell in enumerate(row["cells"])]
+        lines.append((above, row["cells"]))
+    wanted = [_pattern(cell) for cell in parts[1].split("&")]
+    chosen = [cells for names, cells in lines if _named(wanted, names)]
+    if not chosen:
+        known = ", ".join("&".join(map(_plain, names[:2])) for names, _ in lines)
+        raise ResultsError(f"no row is '{parts[1]}'; rows: {known}")
+    title, _, place = parts[2].partition("#")
+    columns = [k for k, name in enumerate(found["columns"]) if _pattern(title).fullmatch(_plain(name))]
+    if len(columns) != 1:
+        known = ", ".join(filter(None, map(_plain, found["columns"])))
+        raise ResultsError(f"{len(columns) or 'no'} column{'s are' if columns else ' is'} '{title}'; columns: {known}")
+    return [_number(cells[columns[0]], place) for cells in chosen]
+
+
+def _named(wanted: list[re.Pattern], names: list[str]) -> bool:
+    return all(pattern.fullmatch(_plain(name)) for pattern, name in zip(wanted, names, strict=False))
+
+
+def _number(cell, place: str) -> str:
+    values = _values(cell) or ([cell] if re.fullmatch(r"-?[\d.]+", str(cell)) else [])
+    if not values:
+        return ""
+    if (len(values) > 1 or place) and place not in map(str, range(1, len(values) + 1)):
+        raise ResultsError(f"the cell has {len(values)} numbers; write #1 to #{len(values)} behind the column")
+    return values[int(place or 1) - 1]
+
+
+def _pattern(text: str) -> re.Pattern:
+    return re.compile(".*".join(map(re.escape, _plain(text).split("*"))), re.S)
+
+
+def _plain(text: str) -> str:
+    return text.replace("`", "").strip()
+
+
+def _short(number: float) -> str:
+    text = f"{number:#.2g}"
+    return (f"{float(text):.0f}" if "e+" in text else text).rstrip(".")
+
+
+def loose_figures(text: str) -> list[str]:
+    """Numbers in prose that look as if they were measured, but are written from no results, and are not exempted."""
+
+    def left(found: re.Match) -> str:
+        return "\n\n" if found[0].startswith(("\n", "    ", "```")) else ""
+
+    text = NO_PROSE.sub(left, VALUE.sub("", BLOCK.sub("", text)))
+    found, exempt = [], False
+    for paragraph in re.split(r"\n\s*\n|\n(?=\s*- )", text):
+        follows, exempt = exempt, bool(EXEMPT.search(" ".join(paragraph.split())))
+        if not exempt and not follows:
+            found += [" ".join(figure.split()) for figure in FIGURE.findall(paragraph)]
+        exempt = EXEMPT.fullmatch(paragraph.strip()) is not None
     return found
 
 

@@ -130,6 +130,7 @@ def test_doc_lists_prints_and_refuses():
 def test_guides_can_be_printed(name):
     text = shown(terminal.guide(pages.guide(name)))
     assert pages.guides()[name] in text
+    assert "<!--" not in text, "marks are for those who write"
 
 
 def commands_in(markdown: str) -> list[list[str]]:

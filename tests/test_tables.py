@@ -4,6 +4,7 @@ import re
 import subprocess
 
 import pytest
+from markdown_it import MarkdownIt
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +21,12 @@ def test_pages_are_as_the_results_have_them(tables):
 def test_no_measured_table_stands_outside_of_the_marks(tables):
     for page in tables.pages():
         assert not tables.loose_tables(page.read_text(encoding="utf-8")), page.name
+
+
+def test_no_measured_figure_stands_in_prose(tables):
+    """Settings are written as code (`0.03`), figures of others after `<!-- no results: REASON -->`."""
+    found = {page.name: tables.loose_figures(page.read_text(encoding="utf-8")) for page in tables.pages()}
+    assert not {name: figures for name, figures in found.items() if figures}
 
 
 def test_every_picture_of_a_page_is_a_result(tables):
@@ -114,6 +121,110 @@ def test_loose_tables_are_found(tables):
     assert not tables.loose_tables(f"<!-- no results: defaults -->\n{table}")
     assert tables.loose_tables(f"<!-- no results -->\n{table}"), "a reason is needed"
     assert not tables.loose_tables("| a |\n|---|\n| `path2` |\n"), "numbers in names do not count"
+
+
+COLUMNS = '["", "", "`path`", "`nrc`, c = 1", "ms: query"]'
+ROWS = """[["door", "frame of 1 s", [0.50, 0.10], [0.30, 0.05], 4], ["", "shot", [0.20, 0.20], [0.05, 0.20], 130],
+    ["lamp", "frame of 1 s", 4, "", "4 ms"], ["two lamps", "shot", 0.8, 0.2, "0.40"]]"""
+
+
+def value(own, tables, address: str, kind: str = "value") -> str:
+    own(COLUMNS, ROWS, '"formats": {"2": "{} / {}"},')
+    text = tables.rewritten(f"It is 9.9<!-- {kind}: {address} -->, less.", tables.ROOT / "page.md")
+    assert text.endswith(f"<!-- {kind}: {address} -->, less.")
+    return text.removeprefix("It is ").partition("<!--")[0]
+
+
+@pytest.mark.parametrize(
+    "address, figure",
+    [
+        ("mine; two lamps; path", "0.8"),
+        ("mine; door&shot; ms: query", "130"),
+        ("mine; door&frame of 1 s; path#1", "0.50"),
+        ("mine; two*; path", "0.8"),
+        ("mine; two lamps; ms*", "0.40"),
+        ("mine; door&shot;\n  nrc*#2", "0.20"),
+        ("mine; door&shot; nrc*#1 / path#1", "0.25"),
+        ("mine; door&shot; ms* / door&frame*; ms*", "32"),
+        ("mine; door&shot; ms* / mine; two lamps; ms*", "320"),
+    ],
+)
+def test_figures_in_prose_are_written_from_results(own, tables, address, figure):
+    """Cells with their digits; ratios with two."""
+    assert value(own, tables, address) == figure
+
+
+def test_figures_of_several_rows(own, tables):
+    """Their least, their most, and their geometric mean; rows without a number are left out."""
+    assert value(own, tables, "mine; door; nrc*#1 / path#1", "least") == "0.25"
+    assert value(own, tables, "mine; door; nrc*#1 / path#1", "most") == "0.60"
+    assert value(own, tables, "mine; door; nrc*#1 / path#1", "mean") == "0.39"
+    assert value(own, tables, "mine; door; nrc*#2", "least") == "0.05"
+    assert value(own, tables, "mine; *&shot; ms*", "mean") == "7.2"
+    assert value(own, tables, "mine; *lamp*; nrc* / path", "most") == "0.25"
+
+
+@pytest.mark.parametrize(
+    "address, error",
+    [
+        ("mine; door", r"'mine; door': a figure is named by NAME; ROW; COLUMN"),
+        ("yours; door; path", "there are no results 'yours'"),
+        ("mine; hall; path", r"'mine; hall; path': no row is 'hall'; rows: door&frame of 1 s,"),
+        ("mine; door; nirc", r"no column is 'nirc'; columns: path, nrc, c = 1, ms: query"),
+        ("mine; door&shot; *", "5 columns are"),
+        ("mine; door&shot; path#3", "the cell has 2 numbers"),
+        ("mine; door&shot; path#x", "the cell has 2 numbers"),
+        ("mine; door&shot; path", "the cell has 2 numbers"),
+        ("mine; door; path#1", "2 rows are 'door'; name one, or write mean, least or most"),
+        ("mine; lamp; nrc*", "the cell has no number"),
+        ("mine; lamp; ms*", "the cell has no number"),
+    ],
+)
+def test_figures_that_are_not_there_are_refused_by_name(own, tables, address, error):
+    with pytest.raises(tables.ResultsError, match=error):
+        value(own, tables, address)
+
+
+def test_a_mark_behind_no_figure_is_refused(own, tables):
+    own('["", "a"]', '[["x", 1]]')
+    page = tables.ROOT / "page.md"
+    assert tables.rewritten("-0.5<!-- value: mine; x; a --> 0-2.e<!-- x -->", page).startswith("1<!--")
+    assert tables.rewritten("1 to 2e-05<!-- value: mine; x; a -->", page).startswith("1 to 1<!--")
+    with pytest.raises(tables.ResultsError, match=r"page\.md: 'mine; x; a' stands behind no number"):
+        tables.rewritten("about <!-- value: mine; x; a -->", page)
+
+
+def test_a_mark_may_be_broken_at_every_space(tables):
+    """No line of it begins a list or a quotation, whichever way an editor wraps the paragraph."""
+    marks = {m[0] for page in tables.pages() for m in tables.VALUE.finditer(page.read_text(encoding="utf-8"))}
+    for mark in {*marks, "1.5<!-- most: mine; *&shot; nrc*#1 / *; path#1 -->"}:
+        text = "\n".join(f"It has {mark}, less.".split())
+        html = MarkdownIt().render(text)
+        assert html.startswith("<p>It\nhas\n") and html.count("<") == 3 and html.endswith("less.</p>\n"), mark
+        assert tables.VALUE.sub("", text) == "It\nhas\n,\nless."
+
+
+@pytest.mark.parametrize(
+    "text, figures",
+    [
+        ("The error is 0.48 there.", ["0.48"]),
+        ("less by 13 %, or 5%", ["13 %", "5%"]),
+        ("from -0.5 to -10 %, 1/2.8, 2-3 %", ["-0.5", "-10 %", "2.8", "3 %"]),
+        ("it takes 12 ms, 3 s and\n40 MiB, 5 times as much", ["12 ms", "3 s", "40 MiB", "5 times"]),
+        ("- one .0022\n- two 2e-05", [".0022", "2e-05"]),
+        ("0.48<!-- value: a; b; c -->", []),
+        ("`rate=0.03`, Mitsuba 3.9.1, version 0.2, 32 lamps, 640x360, (0.5", ["0.5"]),
+        ("    mi-neural --seconds 0.5 5 %\n\n```python\nx = 0.5\n```\n\n1.5", ["1.5"]),
+        ("frames of 0.25 s and a shot of 10 s", []),
+        ("<!-- no results: the paper's -->\n0.48\nand 0.49\n\n0.50", ["0.50"]),
+        ("- 0.48 <!-- no results: the paper's -->\n  and 0.49\n- 0.50", ["0.50"]),
+        ("0.48 `a`\n<!-- no results: of\nthe paper --> 0.49 `b` 0.5", []),
+        ("- 0.48\n  <!-- no results: x -->\n\n  0.49", ["0.49"]),
+        ("<!-- results: x -->\n| 0.5 |\n<!-- end -->\n[doi](https://doi.org/10.1/3.4) e70050", []),
+    ],
+)
+def test_loose_figures_are_found(tables, text, figures):
+    assert tables.loose_figures(text) == figures
 
 
 def test_rows_older_than_their_code_are_named(tables, tmp_path):
