@@ -12,7 +12,7 @@ from .frozen import call, can_freeze, is_special
 from .sampling import PathSampler
 from .spectrum import film_colour
 
-#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB (manual, measured).
+#: Most camera samples traced at once: 1280x720 at 16 samples then fits into 4 GiB.
 PASS_SAMPLES = 2**20
 #: Neighbouring pixels whose samples lie side by side: the lanes of a packet of AVX-512, half a warp.
 PACKET = 16
