@@ -18,7 +18,7 @@ row, or `CELL&CELL` where it takes the second one, too, to tell rows apart; an e
 COLUMN is the column's title; of a list of numbers, `COLUMN#2` takes the second. `*` stands for any text, and backticks
 are left out. ` / ` and the end of a second address (COLUMN, ROW; COLUMN or all) make a ratio. `mean`, `least` and
 `most` in place of `value` take several rows: their geometric mean, or one of them. For example:
-`?<!-- mean: public_denoised; *&frame of 1 s; neural_path#1 / path#1 -->`.
+`?<!-- mean: public_shots; *&10 s; neural_path#1 / path#1 -->`.
 A paragraph with numbers of others contains, or follows, `<!-- no results: REASON -->`.
 """
 
