@@ -42,14 +42,10 @@ class Statement:
     reason: str = ""
 
     @property
-    def result(self) -> str:
-        """Whether both agree, and by how much they differ."""
-        return ", ".join(part for part in (WORDS[self.agrees], self.distance) if part)
-
-    @property
     def verdict(self) -> str:
-        """:attr:`result`, and why both differ."""
-        return self.result if self.agrees or not self.reason else f"{self.result}: {self.reason}"
+        """Whether both agree, by how much they differ, and why."""
+        head = ", ".join(part for part in (WORDS[self.agrees], self.distance) if part)
+        return head if self.agrees or not self.reason else f"{head}: {self.reason}"
 
 
 @dataclass

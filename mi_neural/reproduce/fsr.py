@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -146,21 +147,21 @@ def run(group: Group, settings: Settings, rate: float, smoothing: float, share: 
         truths = [group.part(f"truth_{k}", lambda b, k=k: _truth(settings, k)).arrays["image"] for k in range(2)]
         renderer = Renderer(loaded.scene, max(8, round(share * settings.size[0] * settings.size[1])), settings.vertices)
         found, n_frames = Frames(renderer), settings.before + settings.after
-        unfinished = group.unfinished(name)
+        unfinished, folder = group.unfinished(name), group.folder
         if (kept := unfinished.read()) is not None:
-            found.go_on(kept, unfinished.path.parent)
+            found.go_on(kept, folder)
         try:
             for frame in range(len(found.errors), n_frames):
                 over_time.apply(int(frame >= settings.before))
                 image = found.render(frame, rate, smoothing, truths[frame >= settings.before])
                 if frame in (settings.before - 1, settings.before + min(10, settings.after - 1)):
                     found.shown[f"image_{len(found.shown)}"] = image.astype(np.float32)
-                unfinished.keep(lambda: found.so_far(unfinished.path.parent))
+                unfinished.keep(partial(found.so_far, folder))
                 if bar:
                     bar(frame + 1, n_frames)
         except KeyboardInterrupt:
             if found.between_frames:
-                unfinished.keep(lambda: found.so_far(unfinished.path.parent), now=True)
+                unfinished.keep(partial(found.so_far, folder), now=True)
             raise
         over_time.restore()
         return Part({"error": found.errors, "flicker": found.flicker, "seconds": float(np.median(found.seconds))},
