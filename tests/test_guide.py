@@ -54,12 +54,13 @@ def test_table_has_the_light_where_it_came_from():
     assert shares.min() == pytest.approx(guides.UNIFORM / guides.N_BINS, rel=1e-3)
 
 
-def test_new_light_outweighs_what_is_decayed():
+@pytest.mark.parametrize("decay", [0.0, 0.6])
+def test_new_light_outweighs_what_is_decayed(decay):
     guide = LearnedGuide(*BOX)
     observe(guide, records([20], 500))
-    observe(guide, records([90], 500), decay=0.25)
+    observe(guide, records([90], 500), decay=decay)
     shares = table(guide)[1]
-    assert shares[90] / shares[20] == pytest.approx(4, rel=0.02)
+    assert shares[20] / shares[90] == pytest.approx(1 - (1 - decay) / guides.REMEMBERS, rel=0.03)
 
 
 @pytest.mark.parametrize("n, light, valid", [(guides.FEW - 1, 1.0, True), (500, 0.0, True), (500, 1.0, False)],

@@ -25,6 +25,9 @@ DENSITY = N_BINS / (4 * np.pi)
 UNIFORM, BLUR = 0.02, 0.125
 #: Light above so many times the scene's mean counts as that.
 BRIGHTEST = 1e4
+#: Training steps that learned tables remember, over those of the cache's average. Images that are not denoised have 0.9
+#: (veach-bidir) to 0.98 times the squared error with 1 (64 samples, after 130 and 400 steps).
+REMEMBERS = 4
 
 
 def bin_of(d):
@@ -150,8 +153,9 @@ class LearnedGuide(Guide):
         self.steps = 0
 
     def observe(self, records, reflected, decay) -> None:
-        """Take in incident `records` and how much light each `reflected`. What a bin holds counts `decay` times as much
-        as what is new. May be frozen; :meth:`refresh` makes tables of it."""
+        """Take in incident `records` and how much light each `reflected`. `decay`: of what the cache's average holds,
+        which forgets faster than a bin. May be frozen; :meth:`refresh` makes tables of it."""
+        decay = 1 - (1 - decay) / REMEMBERS
         light = mi.luminance(reflected) / self.scale
         valid = records.valid & dr.isfinite(light)
         cell = self.entry(records.position, main_side(records.normal))
