@@ -26,11 +26,6 @@ QUERIES, QUERIES_DENOISED = 2.0, 1.0
 DENOISED_UNBOUNDED = 0.5
 #: Constants of :func:`denoised_threshold`: the factor of N b², training steps, and the least b² that is believed.
 ENDS, YOUNG, LEAST_BIAS = 0.3, 60.0, 1e-3
-#: Share of directions from the guide, for each unit of one bounce's noise v above 1, and the largest. Where v is less,
-#: stratified directions of the BSDF have less noise: with a share of 0.25 everywhere denoised images of 64 samples had
-#: 1.06 times the squared error in the Cornell box (v = 0.5), and 0.7 to 0.99 times where v is 2.6 to 5 (manual,
-#: measured).
-GUIDED, MOST_GUIDED = 0.25, 0.5
 #: A cache that is trained by time stays out of images until it has so many steps. Denoised images of 16 samples have
 #: over the squared error of `path` after 5, 10, 20, 40, 80 steps: veach-ajar 4.4 to 8.2, 2.5 to 8.4, 1.5 to 1.8, 0.7 to
 #: 2.0, 0.5 to 0.6; living room 1.1 to 1.2, 0.9, 0.8 to 0.9, 0.8, 0.8; Cornell box 1.1, 0.6, 0.6, 0.6, 0.5 (manual,
@@ -76,13 +71,6 @@ class NeuralPathIntegrator(OutgoingIntegrator):
     @property
     def queries_per_sample(self) -> float:
         return (QUERIES_DENOISED if self.denoised else QUERIES) if self.needs_cache else 0.0
-
-    @property
-    def bound_field(self):
-        field = super().bound_field
-        if field is not None:
-            field.guide.refresh(self.cache.steps)
-        return field
 
     @property
     def left_out(self) -> bool:
@@ -154,16 +142,10 @@ class NeuralPathIntegrator(OutgoingIntegrator):
             share = field.grid.share(*place, spp, smooth) if mixes else mi.Float(0)
             return share, smooth & ~first & spread.exceeds(c), mi.Bool(False), sampler
 
-        def guided(path):
-            noise = field.grid.noise_at(*self.walk.place(path), path.active)
-            share = dr.clip(GUIDED * (noise - 1), 0, MOST_GUIDED)
-            return field.guide.guided(path.si.bsdf(path.ray), path.si, share, path.active)
-
         looks = mixes or (cached and shows)
         end, sampler = prefix.trace(
-            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=looks, walk=self.walk,
-            bsdf=guided if cached and not self.walk.in_media else None,
-        )  # fmt: skip
+            self, scene, lights, sampler, ray, active, stop if cached else None, glossy, look=looks, walk=self.walk
+        )
         path, zero = end.path, mi.Color3f(0)
         channels = {"traced": path.L, "cached": zero, "cache": zero, "density": mi.Float(0),
                     "depth": dr.select(path.valid, mi.Float(path.depth), 0),
@@ -219,10 +201,6 @@ NeuralPathIntegrator.__doc__ = (
       :math:`v/N / (v/N + b^2)`.
     - Later vertices: the path ends in the cache where it is wide. The threshold c of the spread test grows with N, so
       that many samples trace further before they end.
-
-    - Directions: where one bounce is noisy (v > 1), up to half of them come from tables of where training paths found
-      light, by cells of 1/16 of the box (path guiding, after Jensen 1995 and Müller et al. 2017). They are weighed
-      against those of the BSDF, so that the mean stays. Not in participating media.
 
     So an image of few samples mainly shows the cache. With more samples its weight falls, and :math:`E[L_o]` tends to
     the path-traced radiance. A denoiser removes noise, but no bias: for an image that will be denoised, set

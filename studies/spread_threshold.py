@@ -6,8 +6,7 @@ SCENE is a scene file with a reference image beside it, or a public scene. One c
 it, for each threshold c and number of samples, one image is rendered and denoised. A line says: the processor's seconds
 of rendering, trimmed relMSE, FLIP against the reference, and FLIP against the denoised reference, which has less noise
 of its own. `path` is the first line of each number of samples, then follow the threshold that `neural_path` chooses by
-itself (`own`), the same without directions from its guide (`unguided`), and the same threshold at every place, however
-few training records lie there (`everywhere`).
+itself (`own`) and the same threshold at every place, however few training records lie there (`everywhere`).
 DIR/spread_threshold.json has all records.
 """
 
@@ -88,11 +87,6 @@ def of_scene(loaded, exact, guides, frames: list[int], spps: list[int], threshol
             print(f"{loaded.name}, {samples} spp: neural_path takes c = {taken:.2g}")
             line("path", path, samples, steps)
             line("own", ours, samples, steps, taken)
-            most, neural_path.MOST_GUIDED = neural_path.MOST_GUIDED, 0.0
-            ours.film_state.passes.clear()  # they were recorded with the constant
-            line("unguided", ours, samples, steps, taken)
-            neural_path.MOST_GUIDED = most
-            ours.film_state.passes.clear()
             # As if records lay evenly; and no measured bias raises the thresholds that are given
             queried.field.density, queried.grid.mean_bias = dr.ones(mi.Float, dr.width(density)), mi.Float(0)
             dr.make_opaque(queried.field.density, queried.grid.mean_bias)

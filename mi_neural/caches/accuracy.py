@@ -17,7 +17,6 @@ import numpy as np
 
 from ..render.surface import scene_is_glossy
 from . import loss
-from .guide import LearnedGuide
 from .outgoing import OutgoingCache, OutgoingTraining, fitted, training_paths
 from .outgoing_field import OutgoingField, OutgoingShape
 from .trainer import found
@@ -102,10 +101,6 @@ class Accuracy:
         i = self.entry(x, normal)
         return self.weight(*(dr.gather(mi.Float, v, i, active) for v in (self.noise, self.bias)), n_samples)
 
-    def noise_at(self, x, normal, active=True):
-        """The noise v of one bounce."""
-        return dr.gather(mi.Float, self.noise, self.entry(x, normal), active)
-
     @staticmethod
     def weight(noise, bias, n_samples):
         """:meth:`share` where v is `noise` and b² is `bias`."""
@@ -181,17 +176,16 @@ class Accuracy:
 
 
 class MeasuredField:
-    """A field of outgoing radiance, and by place how wrong it is (`grid`) and where light comes from (`guide`). A
-    PyTree, with the protocol of a :class:`~mi_neural.caches.blend.Blend`."""
+    """A field of outgoing radiance, and how wrong it is by place (`grid`). A PyTree, with the protocol of a
+    :class:`~mi_neural.caches.blend.Blend`."""
 
-    DRJIT_STRUCT = {"field": object, "grid": object, "guide": object}  # noqa: RUF012
-    #: Grid and guide belong into files.
+    DRJIT_STRUCT = {"field": object, "grid": object}  # noqa: RUF012
+    #: The grid belongs into files.
     IN_FILES = True
 
     def __init__(self, field: OutgoingField, mode: str = "", constants: AccuracyShape | None = None):
         self.field, self.mode = field, mode
         self.grid = Accuracy(*field.box, constants, scale=float(field.scale[0]))
-        self.guide = LearnedGuide(*field.box, scale=float(field.scale[0]))
 
     def query(self, *surface):
         """The field's answer, see :meth:`~mi_neural.caches.outgoing_field.OutgoingField.query`."""
@@ -200,20 +194,13 @@ class MeasuredField:
     def refresh(self) -> None:
         """Answers are the field's own: nothing to bring up to date."""
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What was measured as it is now, as NumPy arrays."""
-        return self.grid.arrays() | self.guide.arrays()
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """The measurements as they are now, for :meth:`restore`."""
+        return self.grid.arrays()
 
-    def set_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        """Go on from :meth:`arrays`; files of older versions have no directions. Raises ``ValueError`` where one does
-        not fit."""
-        guide = {k: v for k, v in arrays.items() if k.startswith("guide.")}
-        self.grid.set_arrays({k: v for k, v in arrays.items() if k not in guide})
-        self.guide.reset()
-        if guide:
-            self.guide.set_arrays(guide)
-
-    snapshot, restore = arrays, set_arrays
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Take the measurements back to a snapshot."""
+        self.grid.set_arrays(state)
 
 
 class MeasuredCache(OutgoingCache):
@@ -241,7 +228,6 @@ class MeasuredCache(OutgoingCache):
             learning_rate, decay = self.pace(ages, records.surface.position, records.valid, rate_factor, field)
             self.note(field, records, seed, decay)
             cache.grid.observe(pairs, decay)
-            cache.guide.observe(traced.incident, traced.reflected, decay)
         value, mean_target, mean_prediction, more = field.learn(
             *records.surface.inputs(), records.target, records.valid, learning_rate, decay, self.training.epsilon
         )

@@ -46,14 +46,6 @@ class Blend:
         self.fast.assign({k: own_copy(v) for k, v in self.field.optimizer.items()})
         self.fast.pack()
 
-    def arrays(self) -> dict:
-        """What files hold of the grid."""
-        return self.grid.arrays()
-
-    def set_arrays(self, arrays: dict) -> None:
-        """Go on from :meth:`arrays`. Raises ``ValueError`` where one does not fit."""
-        self.grid.set_arrays(arrays)
-
     def snapshot(self) -> dict:
         """The grid as it is now, for :meth:`restore`."""
         if self.grid is None:

@@ -50,10 +50,6 @@ class ControlVariate:
     def refresh(self) -> None:
         """Answers are the field's own: nothing to bring up to date."""
 
-    def set_arrays(self, arrays: dict) -> None:
-        """Go on from the arrays of a grid, as files have them."""
-        self.grid.set_arrays(arrays)
-
     def snapshot(self) -> dict:
         """The statistics as they are now, for :meth:`restore`."""
         values = {k: getattr(self.grid, k) for k in self.grid.LEARNED}

@@ -369,7 +369,7 @@ class IncidentCache(Trainer):
         schedule = self.schedule()
         queried, extra, constants = self.queried, {}, None
         if getattr(queried, "IN_FILES", False) and queried.grid is not None:
-            extra, constants = queried.arrays(), asdict(queried.grid.constants)
+            extra, constants = queried.grid.arrays(), asdict(queried.grid.constants)
         extra = extra | {f"ages.{k}": v for k, v in self.ages.arrays().items()}
         self.field.save(path, extra, training=schedule, reliability=constants, **facts)
 
@@ -392,7 +392,7 @@ class IncidentCache(Trainer):
             extra = {k: v for k, v in extra.items() if not k.startswith("ages.")}
             grid = getattr(self.queried, "grid", None)
             if grid is not None and header.get("reliability") == asdict(grid.constants):
-                self.queried.set_arrays(extra)
+                grid.set_arrays(extra)
         except (KeyError, TypeError, ValueError):
             vars(self).update(before)
             raise

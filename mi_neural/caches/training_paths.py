@@ -71,7 +71,6 @@ class PathRecords:
     outgoing   records of what the vertex sends out; only their positions and normals if no surfaces were asked for
     incident   records of the radiance that the BSDF ray brought back, emission excluded; valid for rays of smooth lobes
     direct     direct light that the vertex reflects towards its viewer, traced
-    reflected  light that its BSDF ray brought, emission weighed by MIS, and the vertex reflects
     weight     ``f cos/p`` of the BSDF ray that left it; in media, where incident records were not asked for, times what
                the medium on the way left of the light
     stops      whether the vertex that the ray met is where a pixel's path would end in the cache
@@ -82,7 +81,6 @@ class PathRecords:
     outgoing: OutgoingRecords
     incident: TrainingRecords
     direct: mi.Color3f
-    reflected: mi.Color3f
     weight: mi.Color3f
     stops: mi.Bool
     pdf: mi.Float
@@ -370,5 +368,4 @@ def trace_training_paths(
     n_bad = n_bad, leave_out_nonfinite(incident)
     emitted = vertices.emitted if vertices.arriving is None else vertices.arriving * vertices.emitted
     direct = vertices.estimated + vertices.weight * emitted
-    reflected = vertices.weight * (emitted + incident.target)
-    return PathRecords(records, incident, direct, reflected, vertices.weight, vertices.stops, vertices.pdf, n_bad)
+    return PathRecords(records, incident, direct, vertices.weight, vertices.stops, vertices.pdf, n_bad)

@@ -44,14 +44,14 @@ class Prefix:
 
 def trace(
     integrator, scene, lights, sampler, ray, active, stop: Callable | None, glossy: bool, look: bool = False,
-    walk: SurfaceWalk = SURFACES, bsdf: Callable | None = None,
+    walk: SurfaceWalk = SURFACES,
 ):  # fmt: skip
     """Trace paths as ``path`` does, up to where `stop` ends them. Returns (:class:`Prefix`, sampler).
 
     ``stop(path, spread, smooth, first, sampler)`` is called at each vertex and returns (share, ends, ends lit,
     sampler), see :class:`Prefix`; a share counts at the `first` `smooth` vertex, and 1 ends the path. None: paths run
     on. `glossy`: see :func:`~mi_neural.render.surface.surface_of`. `look`: keep the first surface. `walk`: how paths go
-    on from vertex to vertex. ``bsdf(path)``: the BSDF where a path stands, in place of the surface's.
+    on from vertex to vertex.
     """
     path, sampler = walk.camera_vertex(integrator, scene, ray, sampler, active)
     never = mi.Bool(False)
@@ -69,8 +69,7 @@ def trace(
         numbers, sampler = paths.draw_numbers(sampler)
         if not walk.may_stay:
             numbers = dr.select(here.depth == 1, numbers_first, numbers)
-        own = None if bsdf is None else bsdf(here)
-        found, sampler = walk.bounce(integrator, scene, lights, here, sampler, numbers, own)
+        found, sampler = walk.bounce(integrator, scene, lights, here, sampler, numbers)
         path = walk.advance(integrator, here, found)
         path.active &= ~state.ends_lit
         path, sampler = paths.roulette(path, sampler, integrator.rr_depth + walk.later)
