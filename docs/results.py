@@ -14,7 +14,8 @@ is `gpu`, the table is measured on machines with an NVIDIA GPU only.
 Other programs write other files. `file` is then a pattern of their names in `$OUT`, and `records` the list in such a
 file whose elements take the place of groups (`.`: the whole file is one). A record has the fields of its file beside
 its own; a field inside of a field is written with a dot (`efficiency.colours`). `each` lists the further fields of the
-records that together make one cell. `commands` are run where one command does not measure all rows.
+records that together make one cell. `commands` are run where one command does not measure all rows. With `fields` in
+place of `rows` and `columns` each record is a row of these fields; the first one stands only where it changes.
 """
 
 from __future__ import annotations
@@ -152,6 +153,9 @@ def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
     A row that is not measured keeps its own.
     """
     extract, before = found["extract"], tables.rows(found)
+    if "fields" in extract:
+        found["rows"] = rows_of(measured["groups"], extract["fields"])
+        extract, before = {**extract, "columns": [], "rows": [{}] * len(found["rows"])}, tables.rows(found)
     cells = [list(row["cells"]) for row in before]
     for k, column in enumerate(extract["columns"]):
         if column is None:
@@ -166,6 +170,13 @@ def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
     kept = [{key: row[key] for key in tables.SOURCE if row[key] != found[key]} for row in before]
     found["rows"] = [line if row is not None or not source else {"cells": line, **source}
                      for line, row, source in zip(cells, extract["rows"], kept, strict=True)]  # fmt: skip
+
+
+def rows_of(records: list[dict], fields: list[str]) -> list[list[str]]:
+    """Each record's `fields`, texts, as a row; the first is left out where it is that of the row above."""
+    rows = [[str(record[name]) for name in fields] for record in records]
+    above = [None, *(row[0] for row in rows)]
+    return [["" if row[0] == before else row[0], *row[1:]] for row, before in zip(rows, above, strict=False)]
 
 
 #: What of `extract` says nothing about which group is meant.

@@ -79,6 +79,9 @@ def test_extraction_of_every_table_fits_its_rows_and_columns(results):
     found = [table for table in found if "extract" in table]
     assert len(found) >= 5
     for table in found:
+        if "fields" in table["extract"]:
+            assert len(table["extract"]["fields"]) == len(table["columns"])
+            continue
         assert len(table["extract"]["rows"]) == len(table["rows"])
         assert len(table["extract"]["columns"]) == len(table["columns"])
         keys = ("scene", "label", "integrator", "mode", "budget_seconds", "denoised", "threshold", "asked", "width",
@@ -308,6 +311,13 @@ def test_files_without_what_is_read_are_named(results, table, tmp_path):
         results.collected(tmp_path, "*.json", "lines")
     with pytest.raises(results.ResultsError, match="no group of the comparison has a field flop"):
         results.cell({"scene": "a", "label": "path", "budget_seconds": 2, "values": {"flop": "3g"}}, GROUPS)
+
+
+def test_records_are_rows_where_fields_are_named(results, table):
+    asked = {**table, "columns": ["a", "b"], "extract": {"fields": ["a", "b"]}}
+    records = [{"a": "x", "b": 1, "c": 0}, {"a": "x", "b": 2}, {"a": "y", "b": 3}]
+    results.fill(asked, {"groups": records, "environment": {"cores": 2, "cpu": "c", "mitsuba": "3.9.1"}}, "abc1234", None)
+    assert asked["rows"] == [["x", "1"], ["", "2"], ["y", "3"]] and asked["commit"] == "abc1234"
 
 
 def test_commands_of_one_table_run_in_turn(results, table, tmp_path, monkeypatch):

@@ -42,10 +42,14 @@ class Statement:
     reason: str = ""
 
     @property
+    def brief(self) -> str:
+        """Whether both agree, and by how much they differ."""
+        return ", ".join(part for part in (WORDS[self.agrees], self.distance) if part)
+
+    @property
     def verdict(self) -> str:
         """Whether both agree, by how much they differ, and why."""
-        head = ", ".join(part for part in (WORDS[self.agrees], self.distance) if part)
-        return head if self.agrees or not self.reason else f"{head}: {self.reason}"
+        return self.brief if self.agrees or not self.reason else f"{self.brief}: {self.reason}"
 
 
 @dataclass

@@ -49,7 +49,7 @@ def write(entry: Entry, outcome: Outcome, work: Work, command: str, environment:
         "entry": entry.name, "figure": entry.figure, "shows": entry.shows, "source": entry.source,
         "command": command, "quick": work.quick,
         "settings": work.settings, "environment": environment, "notes": outcome.notes, "tables": outcome.tables,
-        "statements": [vars(s) | {"verdict": s.verdict} for s in outcome.statements],
+        "statements": [vars(s) | {"brief": s.brief, "verdict": s.verdict} for s in outcome.statements],
     }  # fmt: skip
     exr.write_text(folder / "results.json", json.dumps(plain(results), indent=1) + "\n")
     exr.write_text(folder / "index.html", page(entry, outcome, work, command, environment))
