@@ -316,7 +316,8 @@ def test_files_without_what_is_read_are_named(results, table, tmp_path):
 def test_records_are_rows_where_fields_are_named(results, table):
     asked = {**table, "columns": ["a", "b"], "extract": {"fields": ["a", "b"]}}
     records = [{"a": "x", "b": 1, "c": 0}, {"a": "x", "b": 2}, {"a": "y", "b": 3}]
-    results.fill(asked, {"groups": records, "environment": {"cores": 2, "cpu": "c", "mitsuba": "3.9.1"}}, "abc1234", None)
+    machine = {"cores": 2, "cpu": "c", "mitsuba": "3.9.1"}
+    results.fill(asked, {"groups": records, "environment": machine}, "abc1234", None)
     assert asked["rows"] == [["x", "1"], ["", "2"], ["y", "3"]] and asked["commit"] == "abc1234"
 
 
