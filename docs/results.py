@@ -153,9 +153,13 @@ def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
     A row that is not measured keeps its own.
     """
     extract, before = found["extract"], tables.rows(found)
+    where = measured["environment"]
+    machine = machine or where.get("machine") or f"{where['cores']} cores ({where['cpu']})"
+    today = datetime.date.today().isoformat()
+    made = {"commit": commit, "date": today, "mitsuba": where["mitsuba"], "machine": machine}
     if "fields" in extract:
-        found["rows"] = rows_of(measured["groups"], extract["fields"])
-        extract, before = {**extract, "columns": [], "rows": [{}] * len(found["rows"])}, tables.rows(found)
+        found.update(made, rows=rows_of(measured["groups"], extract["fields"]))
+        return
     cells = [list(row["cells"]) for row in before]
     for k, column in enumerate(extract["columns"]):
         if column is None:
@@ -164,9 +168,7 @@ def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
         for line, row in zip(cells, extract["rows"], strict=True):
             if row is not None:
                 line[k] = cell({**extract, **column, **row}, measured["groups"])
-    where = measured["environment"]
-    machine = machine or where.get("machine") or f"{where['cores']} cores ({where['cpu']})"
-    found.update(commit=commit, date=datetime.date.today().isoformat(), mitsuba=where["mitsuba"], machine=machine)
+    found.update(made)
     kept = [{key: row[key] for key in tables.SOURCE if row[key] != found[key]} for row in before]
     found["rows"] = [line if row is not None or not source else {"cells": line, **source}
                      for line, row, source in zip(cells, extract["rows"], kept, strict=True)]  # fmt: skip
@@ -175,8 +177,7 @@ def fill(found: dict, measured: dict, commit: str, machine: str | None) -> None:
 def rows_of(records: list[dict], fields: list[str]) -> list[list[str]]:
     """Each record's `fields`, texts, as a row; the first is left out where it is that of the row above."""
     rows = [[str(record[name]) for name in fields] for record in records]
-    above = [None, *(row[0] for row in rows)]
-    return [["" if row[0] == before else row[0], *row[1:]] for row, before in zip(rows, above, strict=False)]
+    return [["" if k and rows[k - 1][0] == row[0] else row[0], *row[1:]] for k, row in enumerate(rows)]
 
 
 #: What of `extract` says nothing about which group is meant.
